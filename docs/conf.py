@@ -1,7 +1,10 @@
-"""The book: `sphinx-build --fail-on-warning docs outputs/book`, in an environment with the extra `book`.
+"""The book, in an environment with the extra `book`.
 
-Building it runs the tutorials; those that have not changed since the last build are taken from the cache in `outputs/`.
-`WARP_RESPHYS_TUTORIALS=short` in the environment runs their short form (`extensions/short_form.py`).
+sphinx-build --fail-on-warning docs outputs/book
+
+Building it runs the tutorials; those that have not changed since the last build are taken from the
+cache in `outputs/`. `WARP_RESPHYS_TUTORIALS=short` in the environment runs their short form
+(`extensions/short_form.py`).
 """
 
 import re
@@ -73,8 +76,12 @@ _LITERAL = re.compile(r"(``.+?``|`.+?`)")
 _MARKUP = re.compile(r"(?<!\\)([|*])")
 
 
-def _escape(_app: Sphinx, what: str, _name: str, _found: Any, _options: Any, lines: list[str]) -> None:
-    """Docstrings are plain text beside their literals: a bar is a norm and a star a product, not markup."""
+def _escape(
+    _app: Sphinx, what: str, _name: str, _found: Any, _options: Any, lines: list[str]
+) -> None:
+    """Docstrings are plain text beside their literals:
+    a bar is a norm and a star a product, not markup.
+    """
     if what == "module":
         del lines[:1]  # it stands below the heading, by `extensions/api_pages.py`
     for number, line in enumerate(lines):
@@ -86,4 +93,5 @@ def _escape(_app: Sphinx, what: str, _name: str, _found: Any, _options: Any, lin
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
     app.connect("autodoc-process-docstring", _escape, priority=600)  # after Napoleon
-    app.extensions["sphinx-mathjax-offline"].parallel_read_safe = True  # it copies files after the pages are read
+    # It copies files after the pages are read.
+    app.extensions["sphinx-mathjax-offline"].parallel_read_safe = True

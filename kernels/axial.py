@@ -1,12 +1,13 @@
 """Laws that are functions of a length: fibres, muscles, and inertia.
 
-The vector x at a point less an origin o has the length l and the unit vector u. With the values v, a tension gives
+The vector x at a point less an origin o has the length l and the unit vector u. With the values v,
+a tension gives
 
     e(l, v),   t = de/dl,   slope dt/dl,   and dt/dv,
 
-so that the stress is t u and the tangent slope u u^T + t / l (1 - u u^T), which has a negative eigenvalue only for a
-negative tension. The origin is zero, or for inertia the first three values. The last value of fibres, the
-elongation over which they become taut, is a constant.
+so that the stress is t u and the tangent slope u u^T + t / l (1 - u u^T), which has a negative
+eigenvalue only for a negative tension. The origin is zero, or for inertia the first three values.
+The last value of fibres, the elongation over which they become taut, is a constant.
 """
 
 from typing import Any
@@ -16,14 +17,20 @@ import warp as wp
 from .laws import Law
 from .modules import named_module
 
-ZERO, HALF, ONE, TWO, THREE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0), wp.float64(3.0)
+ZERO = wp.float64(0.0)
+HALF = wp.float64(0.5)
+ONE = wp.float64(1.0)
+TWO = wp.float64(2.0)
+THREE = wp.float64(3.0)
 SIXTH, TWENTY_FOURTH = wp.float64(1.0 / 6.0), wp.float64(1.0 / 24.0)
 QUARTER, TENTH, FORTIETH = wp.float64(0.25), wp.float64(0.1), wp.float64(0.025)
 
 
 @wp.func
 def thread_pull(strain: wp.float64, toe: wp.float64):
-    """Returns energy s, force and slope of a thread of stiffness one: zero in compression, linear beyond the toe."""
+    """Returns energy s, force and slope of a thread of stiffness one:
+    zero in compression, linear beyond the toe.
+    """
     energy = ZERO
     force = ZERO
     slope = ZERO
@@ -40,10 +47,12 @@ def thread_pull(strain: wp.float64, toe: wp.float64):
 
 @wp.func
 def muscle_pull(strain: wp.float64, toe: wp.float64):
-    """Returns energy s, force and slope of a fibre of stiffness one; the slope rises as 3 t^2 - 2 t^3 over the toe.
+    """Returns energy s, force and slope of a fibre of stiffness one.
 
-    Smoother than `thread_pull`, with the same force beyond the toe: a solid has fibres at every strain, and derivatives
-    are compared with differences over all of them.
+    The slope rises as 3 t^2 - 2 t^3 over the toe.
+
+    Smoother than `thread_pull`, with the same force beyond the toe: a solid has fibres at every
+    strain, and derivatives are compared with differences over all of them.
     """
     energy = ZERO
     force = ZERO
@@ -62,14 +71,20 @@ def muscle_pull(strain: wp.float64, toe: wp.float64):
 
 @wp.func
 def thread_tension(length: wp.float64, v: wp.vec2d):
-    """Describes a thread, ``k s(l - 1)``, with s(e) = max(e, 0)^2 / 2 smoothed over a toe; v = (k, toe)."""
+    """Describes a thread, ``k s(l - 1)``, with s(e) = max(e, 0)^2 / 2 smoothed over a toe.
+
+    V = (k, toe).
+    """
     energy, force, slope = thread_pull(length - ONE, v[1])
     return v[0] * energy, v[0] * force, v[0] * slope, wp.vec2d(force, ZERO)
 
 
 @wp.func
 def muscle_tension(length: wp.float64, v: wp.vec4d):
-    """Describes active stress and a contracted spring, ``sigma l + k s(l - 1 + c)``; v = (sigma, c, k, toe)."""
+    """Describes active stress and a contracted spring, ``sigma l + k s(l - 1 + c)``.
+
+    V = (sigma, c, k, toe).
+    """
     energy, force, slope = muscle_pull(length - ONE + v[1], v[3])
     by_values = wp.vec4d(ONE, v[2] * slope, force, ZERO)
     return v[0] * length + v[2] * energy, v[0] + v[2] * force, v[2] * slope, by_values
@@ -85,7 +100,10 @@ def stiffness_across(length: wp.float64, pull: wp.float64, slope: wp.float64) ->
 
 @wp.func
 def inertia_tension(length: wp.float64, v: wp.vec4d):
-    """Describes the inertia of a point in a step, ``k / 2 l^2`` from its target; v = (target, k) [m, N/m]."""
+    """Describes the inertia of a point in a step, ``k / 2 l^2`` from its target.
+
+    V = (target, k) [m, N/m].
+    """
     pull = v[3] * length
     return HALF * pull * length, pull, v[3], wp.vec4d(ZERO, ZERO, ZERO, length)
 
@@ -138,5 +156,6 @@ def _axial_law(name: str, tension: Any, tied: bool = False) -> Law:
     return Law(name, vector, response, slopes, tangent)
 
 
-THREAD, MUSCLE = _axial_law("axial.thread", thread_tension), _axial_law("axial.muscle", muscle_tension)
+THREAD = _axial_law("axial.thread", thread_tension)
+MUSCLE = _axial_law("axial.muscle", muscle_tension)
 INERTIA = _axial_law("axial.inertia", inertia_tension, tied=True)

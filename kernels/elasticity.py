@@ -1,4 +1,6 @@
-"""Elastic and viscous energy of a solid: local step, tangent and derivatives by the constants, for any material."""
+"""Elastic and viscous energy of a solid: local step,
+tangent and derivatives by the constants, for any material.
+"""
 
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +13,8 @@ from .points import MatrixPoints, green_strain, matrix_at
 
 wp.set_module_options({"enable_backward": False})
 
-BOUNDS = (128, 4)  # of threads a block and blocks a multiprocessor: at most 128 registers a thread, of a GPU's 65,536
+# Of threads a block and blocks a multiprocessor: at most 128 registers a thread, of a GPU's 65,536.
+BOUNDS = (128, 4)
 ZERO, HALF, TWO, FOUR = wp.float64(0.0), wp.float64(0.5), wp.float64(2.0), wp.float64(4.0)
 
 
@@ -41,19 +44,28 @@ def strain_adjoint(
 
 
 @wp.func
-def isotropic(strain: wp.mat33d, dilation: wp.float64, shape: wp.float64, volume: wp.float64) -> wp.mat33d:
+def isotropic(
+    strain: wp.mat33d, dilation: wp.float64, shape: wp.float64, volume: wp.float64
+) -> wp.mat33d:
     """Returns 2 mu E + lambda e I."""
     t = volume * dilation
     return TWO * shape * strain + wp.mat33d(t, ZERO, ZERO, ZERO, t, ZERO, ZERO, ZERO, t)
 
 
 @wp.func
-def viscous_response(f: wp.mat33d, lame: wp.vec2d, c: wp.vec2d, offset: wp.mat33d, dilation_offset: wp.float64):
-    """Returns energy and stress by viscosity (`energies.viscosity`), with mu and lambda times the point's volume."""
+def viscous_response(
+    f: wp.mat33d, lame: wp.vec2d, c: wp.vec2d, offset: wp.mat33d, dilation_offset: wp.float64
+):
+    """Returns energy and stress by viscosity (`energies.viscosity`),
+    with mu and lambda times the point's volume.
+    """
     strain = green_strain(f)
     dilation = wp.trace(strain)
     left, rest = c[0] * strain - offset, c[1] * dilation - dilation_offset
-    energy = lame[0] * wp.ddot(left - offset, strain) + HALF * lame[1] * (rest - dilation_offset) * dilation
+    energy = (
+        lame[0] * wp.ddot(left - offset, strain)
+        + HALF * lame[1] * (rest - dilation_offset) * dilation
+    )
     return energy, f * isotropic(left, rest, lame[0], lame[1])
 
 
@@ -67,18 +79,25 @@ def add_viscous_tangent(
     clamp: bool,
     out: wp.array[wp.mat33d],
 ):
-    """Adds the blocks of `viscous_response`; clamped ones without the part by stress, which may be indefinite."""
+    """Adds the blocks of `viscous_response`.
+
+    Clamped ones without the part by stress, which may be indefinite.
+    """
     stress = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
     if not clamp:
         strain = green_strain(f)
-        stress = isotropic(c[0] * strain - offset, c[1] * wp.trace(strain) - dilation_offset, lame[0], lame[1])
+        stress = isotropic(
+            c[0] * strain - offset, c[1] * wp.trace(strain) - dilation_offset, lame[0], lame[1]
+        )
     shape = c[0] * lame[0]
     volume = c[1] * lame[1]
     columns = wp.transpose(f)
     left = shape * (f * columns)
     for k in range(3):
         for n in range(k + 1):
-            block = shape * wp.outer(columns[n], columns[k]) + volume * wp.outer(columns[k], columns[n])
+            block = shape * wp.outer(columns[n], columns[k]) + volume * wp.outer(
+                columns[k], columns[n]
+            )
             if k == n:
                 block += left
             block[0, 0] += stress[k, n]
@@ -89,9 +108,16 @@ def add_viscous_tangent(
 
 @wp.func
 def viscous_slopes(
-    f: wp.mat33d, dz: wp.mat33d, lame: wp.vec2d, c: wp.vec2d, offset: wp.mat33d, dilation_offset: wp.float64
+    f: wp.mat33d,
+    dz: wp.mat33d,
+    lame: wp.vec2d,
+    c: wp.vec2d,
+    offset: wp.mat33d,
+    dilation_offset: wp.float64,
 ):
-    """Returns the derivatives of `viscous_response`'s stress : dz by lame, c, offset and dilation_offset."""
+    """Returns the derivatives of `viscous_response`'s stress :
+    dz by lame, c, offset and dilation_offset.
+    """
     rise = wp.transpose(f) * dz
     rise = HALF * (rise + wp.transpose(rise))
     swelling = wp.trace(rise)
@@ -100,7 +126,9 @@ def viscous_slopes(
     by_lame = wp.vec2d()
     if c[0] + c[1] > ZERO:  # Without viscosity the offsets are not set.
         left = c[0] * strain - offset
-        by_lame = wp.vec2d(TWO * wp.ddot(left, rise), (c[1] * dilation - dilation_offset) * swelling)
+        by_lame = wp.vec2d(
+            TWO * wp.ddot(left, rise), (c[1] * dilation - dilation_offset) * swelling
+        )
     by_c = wp.vec2d(TWO * lame[0] * wp.ddot(strain, rise), lame[1] * dilation * swelling)
     return by_lame, by_c, (-TWO * lame[0]) * rise, -lame[1] * swelling
 
@@ -132,11 +160,15 @@ def viscosity_of(law: Law) -> SimpleNamespace:
         energy, stress = wp.float64(0.0), wp.mat33d()
         if c[0] + c[1] > ZERO:
             lame = lame_of(values.stiffness[b, p])
-            energy, stress = viscous_response(f, lame, c, values.strain_offset[b, p], values.dilation_offset[b, p])
+            energy, stress = viscous_response(
+                f, lame, c, values.strain_offset[b, p], values.dilation_offset[b, p]
+            )
         return energy, stress
 
     @wp.func(module=module)
-    def add_tangent(f: wp.mat33d, values: Values, b: int, p: int, clamp: bool, out: wp.array[wp.mat33d]):
+    def add_tangent(
+        f: wp.mat33d, values: Values, b: int, p: int, clamp: bool, out: wp.array[wp.mat33d]
+    ):
         """Adds the blocks of `respond`."""
         c = values.viscosity[b]
         if c[0] + c[1] > ZERO:
@@ -152,7 +184,10 @@ def viscosity_of(law: Law) -> SimpleNamespace:
 def adjoint_kernel(law: Law) -> Any:
     """Returns the kernel of a material for derivatives by the values of a step."""
     viscosity, slopes, vector = viscosity_of(law), law.slopes, law.values
-    values_type, lame_of, mu_of, lambda_of = viscosity.Values, viscosity.lame_of, viscosity.mu_of, viscosity.lambda_of
+    values_type = viscosity.Values
+    lame_of = viscosity.lame_of
+    mu_of = viscosity.mu_of
+    lambda_of = viscosity.lambda_of
 
     @wp.kernel(module=named_module(law.name))
     def adjoint(
@@ -166,15 +201,23 @@ def adjoint_kernel(law: Law) -> Any:
         strain_out: wp.array2d[wp.mat33d],  # (B, P) dL/d strain_offset
         dilation_out: wp.array2d[wp.float64],  # (B, P) dL/d dilation_offset
     ):
-        """Computes dL/dtheta = -z . d(internal residual)/dtheta = -dP/dtheta : grad z, at fixed positions."""
+        """Computes dL/dtheta = -z . d(internal residual)/dtheta = -dP/dtheta :
+        grad z, at fixed positions.
+        """
         b, p = wp.tid()
         f = matrix_at(points, positions, b, p)
         dz = matrix_at(points, direction, b, p)
         m = values.stiffness[b, p]
-        # A stiffness of zero (nu = 0) has a derivative too, so only the volumes decide what is skipped.
+        # A stiffness of zero (nu = 0) has a derivative too, so only the volumes decide what is
+        # skipped.
         elastic = slopes(f, dz, m, carried[p])
         by_lame, by_c, by_strain, by_dilation = viscous_slopes(
-            f, dz, lame_of(m), values.viscosity[b], values.strain_offset[b, p], values.dilation_offset[b, p]
+            f,
+            dz,
+            lame_of(m),
+            values.viscosity[b],
+            values.strain_offset[b, p],
+            values.dilation_offset[b, p],
         )
         stiffness_out[b, p] = -elastic - by_lame[0] * mu_of - by_lame[1] * lambda_of
         viscosity_out[b, p] = -by_c
@@ -226,4 +269,6 @@ def solid_kernels(law: Law) -> SimpleNamespace:
         elastic_tangent(f, values.stiffness[b, p], clamp[b] != 0, out)
         add_tangent(f, values, b, p, clamp[b] != 0, out)
 
-    return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint_kernel(law), Values=values_type)
+    return SimpleNamespace(
+        local_step=local_step, tangent=tangent, adjoint=adjoint_kernel(law), Values=values_type
+    )

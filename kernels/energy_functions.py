@@ -1,13 +1,16 @@
-"""The law of an energy given as one Warp function of the kinematic variable at a point and of its values.
+"""The law of an energy given as one Warp function of the kinematic variable
+at a point and of its values.
 
-The function e(f, v) returns the energy of a point of weight one; f is a vector or a matrix (`points`), v the vector of
-values. From it follow
+The function e(f, v) returns the energy of a point of weight one; f is a vector or a matrix
+(`points`), v the vector of values. From it follow
 
 - the stress de/df, exact, by Warp's differentiation of the function;
-- the tangent d2e/df2, by fourth-order differences of the exact stress with the step h = 3e-4 times the size of f that
-  the energy declares. The error is about h^4/30 times a fifth derivative, plus 1e-12 of the stress over the size of f
-  from rounding: 1e-9 of the tangent or better, where e is smooth over h (tests/energies/test_pointwise.py);
-- the derivatives by the values, d/ds de/dv(f + s df), by the same differences of the exact de/dv along df.
+- the tangent d2e/df2, by fourth-order differences of the exact stress with the step h = 3e-4 times
+  the size of f that the energy declares. The error is about h^4/30 times a fifth derivative, plus
+  1e-12 of the stress over the size of f from rounding: 1e-9 of the tangent or better, where e is
+  smooth over h (tests/energies/test_pointwise.py);
+- the derivatives by the values, d/ds de/dv(f + s df), by the same differences of the exact de/dv
+  along df.
 
 A clamped tangent is the nearest one without negative eigenvalues.
 """
@@ -20,7 +23,8 @@ from .laws import Law
 from .modules import generated, named_module
 
 STEP = 3e-4  # of differences, over the size of f
-OFFSETS, SHARES = wp.constant(wp.vec4d(1.0, -1.0, 2.0, -2.0)), wp.constant(wp.vec4d(8.0, -8.0, -1.0, 1.0))
+OFFSETS = wp.constant(wp.vec4d(1.0, -1.0, 2.0, -2.0))
+SHARES = wp.constant(wp.vec4d(8.0, -8.0, -1.0, 1.0))
 TWELVE, ZERO, HALF, ONE = wp.float64(12.0), wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
 SWEEPS = wp.constant(30)
 CONVERGED = wp.constant(wp.float64(1e-30))  # squared entries off the diagonal, over all
@@ -71,7 +75,9 @@ def without_negative_eigenvalues(h: mat99) -> mat99:
 
 @wp.func
 def write_blocks(hessian: mat99, columns: int, clamp: bool, out: wp.array[wp.mat33d]):
-    """Writes the blocks of a second derivative by F, or by its first column, ordered by column and row of F."""
+    """Writes the blocks of a second derivative by F,
+    or by its first column, ordered by column and row of F.
+    """
     hessian = HALF * (hessian + wp.transpose(hessian))
     if clamp:
         hessian = without_negative_eigenvalues(hessian)
@@ -111,7 +117,9 @@ def matrix_entry(f: wp.mat33d, row: int, column: int) -> wp.float64:
 
 
 @generated
-def derived_law(name: str, energy: Any, size: float = 1.0, lame: tuple[tuple[float, float], ...] = ()) -> Law:
+def derived_law(
+    name: str, energy: Any, size: float = 1.0, lame: tuple[tuple[float, float], ...] = ()
+) -> Law:
     """Returns the law of an energy function.
 
     Args:

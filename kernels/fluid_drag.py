@@ -1,10 +1,11 @@
 """Drag and added mass of a medium on a surface over an implicit stage: stress and tangent.
 
-A point of the surface is at x = sum_a g_a x_a. With its area a and normal n at the start of the step, its displacement
-d since then, its offset e from the inertial target, and the coefficients c = (linear, normal, tangential, inertial) of
-the step, its energy is
+A point of the surface is at x = sum_a g_a x_a. With its area a and normal n at the start of the
+step, its displacement d since then, its offset e from the inertial target, and the coefficients
+c = (linear, normal, tangential, inertial) of the step, its energy is
 
-    a (c_l / 2 |d|^2 + c_n / 3 |d . n|^3 + c_t / 3 |d_t|^3 + c_i / 2 (e . n)^2),     d_t = d - (d . n) n .
+    a (c_l / 2 |d|^2 + c_n / 3 |d . n|^3 + c_t / 3 |d_t|^3 + c_i / 2 (e . n)^2),
+    d_t = d - (d . n) n .
 """
 
 import warp as wp
@@ -18,7 +19,9 @@ ZERO, HALF, THIRD = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0 / 3.0)
 
 @wp.func
 def split(displacement: wp.vec3d, area: wp.vec3d):
-    """Returns size and normal of an area, and the normal (scalar) and tangential (vector) parts of a displacement."""
+    """Returns size and normal of an area, and the normal (scalar)
+    and tangential (vector) parts of a displacement.
+    """
     n = wp.normalize(area)
     across = wp.dot(displacement, n)
     return wp.length(area), n, across, displacement - across * n
@@ -47,10 +50,14 @@ def local_step(
     a, n, across, along = split(d, area[b, p])
     slip = wp.length(along)
     inertial = wp.dot(e, n)
-    force = a * (c[0] * d + (c[1] * wp.abs(across) * across + c[3] * inertial) * n + c[2] * slip * along)
+    force = a * (
+        c[0] * d + (c[1] * wp.abs(across) * across + c[3] * inertial) * n + c[2] * slip * along
+    )
     stress_out[b, p] = force
     cubes = c[1] * wp.abs(across) * across * across + c[2] * slip * slip * slip
-    energy_out[b, p] = a * (HALF * (c[0] * wp.dot(d, d) + c[3] * inertial * inertial) + THIRD * cubes)
+    energy_out[b, p] = a * (
+        HALF * (c[0] * wp.dot(d, d) + c[3] * inertial * inertial) + THIRD * cubes
+    )
 
 
 @wp.kernel

@@ -10,8 +10,9 @@ ZERO = wp.float64(0.0)
 vec4d = wp.types.vector(4, wp.float64)
 
 
-# The potential of a uniform gauge pressure p is -p V (Bonet and Wood 2008, section 8.5.2). The faces are oriented into
-# the chamber: V = -sum_q w_q det F, F = [x - c, t1, t2], with the values v = (p, c). The apex c is constant.
+# The potential of a uniform gauge pressure p is -p V (Bonet and Wood 2008, section 8.5.2). The
+# faces are oriented into the chamber: V = -sum_q w_q det F, F = [x - c, t1, t2], with the values
+# v = (p, c). The apex c is constant.
 @wp.func
 def seen_from_apex(f: wp.mat33d, v: vec4d) -> wp.mat33d:
     """Returns F = [x - c, t1, t2] from [x, t1, t2]."""
@@ -33,7 +34,8 @@ def slopes(f: wp.mat33d, df: wp.mat33d, v: vec4d, carried: vec4d) -> vec4d:
 
 @wp.func
 def tangent(f: wp.mat33d, v: vec4d, clamp: bool, out: wp.array[wp.mat33d]):
-    """Writes the derivative of cof F, whose column k is the cross product of the next two columns of F.
+    """Writes the derivative of cof F, whose column k is the cross product
+    of the next two columns of F.
 
     With `clamp` it is zero, as the eigenvalues have both signs.
     """

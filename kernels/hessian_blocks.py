@@ -13,8 +13,8 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def sum_blocks(
     start: wp.array[int],  # (R + 1) first entry of every row in `incident`
-    incident: wp.array[int],  # 4 pair + number of the vertex in it, in ascending order: a fixed summation order
-    rows: wp.array[wp.vec3i],  # (R) first value of the matrix of a row, its size, and the number of the row's vertex
+    incident: wp.array[int],  # 4 pair + its number in it, ascending: a fixed summation order
+    rows: wp.array[wp.vec3i],  # (R) first value of a row's matrix, its size, the row's vertex
     columns: wp.array[wp.vec4i],  # (A) numbers of the vertices of a pair, -1: left out
     blocks: wp.array3d[wp.float64],  # (A, 12, 12) [N/m]
     matrices_out: wp.array[wp.float64],  # matrices, one after another, zero before
@@ -40,7 +40,7 @@ def cell_blocks(
     points: MatrixPoints,
     tangent: wp.array3d[wp.mat33d],  # (B, P, 6)
     block_offset: int,
-    blocks_out: wp.array2d[wp.mat33d],  # (B, C K (K + 1) / 2 from block_offset on) [N/m], rows a >= columns c
+    blocks_out: wp.array2d[wp.mat33d],  # (B, C K (K + 1) / 2 from block_offset on) [N/m], a >= c
 ):
     """Computes the blocks (a, c) of a cell, d force_a / d x_c."""
     b, cell, a = wp.tid()
@@ -65,7 +65,7 @@ def cell_blocks(
 
 @wp.func
 def matrix_block(t: wp.array[wp.mat33d], g: wp.vec3d, h: wp.vec3d) -> wp.mat33d:
-    """Returns the stiffness between nodes with the operators g and h, from a tangent's six blocks."""
+    """Returns the stiffness between nodes with operators g and h, from a tangent's six blocks."""
     total = (g[0] * h[0]) * t[0] + (g[1] * h[1]) * t[2] + (g[2] * h[2]) * t[5]
     total += (g[1] * h[0]) * t[1] + (g[0] * h[1]) * wp.transpose(t[1])
     total += (g[2] * h[0]) * t[3] + (g[0] * h[2]) * wp.transpose(t[3])
@@ -84,7 +84,9 @@ def pair_kernel(width: int) -> Any:
 
     That is more arithmetic, but every block is written once.
     """
-    points_type, block = (VectorPoints, vector_block) if width == 1 else (MatrixPoints, matrix_block)
+    points_type, block = (
+        (VectorPoints, vector_block) if width == 1 else (MatrixPoints, matrix_block)
+    )
 
     @wp.kernel(module=named_module(f"hessian_blocks.{width}"))
     def pair_blocks(
@@ -101,7 +103,11 @@ def pair_kernel(width: int) -> Any:
         total = wp.mat33d()
         for q in range(points.per_cell):
             p = cell * points.per_cell + q
-            total += block(tangent[b, p], points.operators[p, pairs[pair, 0]], points.operators[p, pairs[pair, 1]])
+            total += block(
+                tangent[b, p],
+                points.operators[p, pairs[pair, 0]],
+                points.operators[p, pairs[pair, 1]],
+            )
         blocks_out[b, block_offset + cell * pairs.shape[0] + pair] = total
 
     return pair_blocks
@@ -157,12 +163,14 @@ def projection_kernel(scalar: Any) -> Any:
     @wp.kernel(module=module)
     def project_blocks(
         active: wp.array[int],  # (B) zero: skip the environment
-        blocks: wp.array2d[int],  # (T, 3) block, and the projections of its row and its column, or -1
+        blocks: wp.array2d[int],  # (T, 3) block, projections of its row and column, or -1
         projections: wp.array[wp.mat33d],  # (R)
         address: wp.array2d[int],  # (blocks, 9) index in the value array, or -1
         values_out: wp.array2d[scalar],  # (B, layout size) [N/m]
     ):
-        """Replaces H by P H P, plus the mean diagonal entry in the directions normal to symmetry planes."""
+        """Replaces H by P H P, plus the mean diagonal entry
+        in the directions normal to symmetry planes.
+        """
         b, t = wp.tid()
         if active[b] == 0:
             return

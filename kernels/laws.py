@@ -1,8 +1,8 @@
 """Laws, which give the energy of a point and its derivatives, and their kernels.
 
-The energy e(f, v) of a point of weight one is a function of the vector or the matrix f at the point (`points`) and of
-values v. With the point's weight w, the stress is w de/df, the tangent w d2e/df2, and the derivatives by the values
--z . d residual/dv = -w d2e/dfdv . dz, with dz = sum_a g_a z_a.
+The energy e(f, v) of a point of weight one is a function of the vector or the matrix f at the point
+(`points`) and of values v. With the point's weight w, the stress is w de/df, the tangent w d2e/df2,
+and the derivatives by the values -z . d residual/dv = -w d2e/dfdv . dz, with dz = sum_a g_a z_a.
 """
 
 from dataclasses import dataclass
@@ -23,10 +23,14 @@ class Law:
         name: name of its Warp module.
         values: vector type of v; of a material, moduli times the point's volumes.
         response: (f, v) -> e and de/df.
-        slopes: (f, df, v, carried) -> derivatives by v of de/df : df; undefined where ``carried`` is zero.
-        tangent: (f, v, clamp, out), writes the blocks of d2e/df2; with ``clamp``, without negative eigenvalues.
-        lame: of a material, the contribution of each value to the Lame constants (mu, lambda) of small strains.
-        has_lanes: whether the first value has the shape term of `kernels.lanes`, and no other one a shape term.
+        slopes: (f, df, v, carried) -> derivatives by v of de/df : df; undefined where ``carried``
+            is zero.
+        tangent: (f, v, clamp, out), writes the blocks of d2e/df2; with ``clamp``, without negative
+            eigenvalues.
+        lame: of a material, the contribution of each value to the Lame constants (mu, lambda) of
+            small strains.
+        has_lanes: whether the first value has the shape term of `kernels.lanes`, and no other one a
+            shape term.
     """
 
     name: str

@@ -1,6 +1,8 @@
-"""L-BFGS directions of a batch in compact form (Byrd, Nocedal and Schnabel 1994), with the matrix of the global step.
+"""L-BFGS directions of a batch in compact form (Byrd, Nocedal and Schnabel 1994),
+with the matrix of the global step.
 
-Without pairs, a direction is that of the matrix alone. ``pairs`` is a struct `Pairs` of either type.
+Without pairs, a direction is that of the matrix alone. ``pairs`` is a struct `Pairs` of either
+type.
 """
 
 from types import SimpleNamespace
@@ -36,7 +38,7 @@ def substitute_backward(pairs: Any, b: int, k: int):
 
 @wp.func
 def substitute_forward(pairs: Any, b: int, i: int, product: wp.float64):
-    """Solves row i of R^T b = D a - Y z after the rows before it, from the product, row i of Y z."""
+    """Solves row i of R^T b = D a - Y z after rows before it, from the product, row i of Y z."""
     here = place(pairs, b, i)
     diagonal = pairs.r[b, here, here]
     rest = diagonal * pairs.a[b, i] - product
@@ -47,7 +49,12 @@ def substitute_forward(pairs: Any, b: int, i: int, product: wp.float64):
 
 @wp.func
 def direction_and_slope(
-    vertex_at: wp.array[int], solution: wp.array2d[Any], search: LineSearch, pairs: Any, b: int, lane: int
+    vertex_at: wp.array[int],
+    solution: wp.array2d[Any],
+    search: LineSearch,
+    pairs: Any,
+    b: int,
+    lane: int,
 ) -> wp.float64:
     """Writes the direction -(z + S^T b), with b = R^-T (D a - Y z), and returns its slope."""
     k = pairs.count[b]
@@ -69,7 +76,9 @@ def direction_and_slope(
 
 
 @wp.func
-def add_pair(pairs: Any, b: int, lane: int, step: wp.float64, search: LineSearch, after: wp.array2d[wp.vec3d]):
+def add_pair(
+    pairs: Any, b: int, lane: int, step: wp.float64, search: LineSearch, after: wp.array2d[wp.vec3d]
+):
     """Stores a pair of positive curvature, from the residual after a step."""
     m, n, lanes = pairs.s.shape[1], after.shape[1], wp.block_dim()
     k = pairs.count[b]
@@ -103,12 +112,18 @@ def add_pair(pairs: Any, b: int, lane: int, step: wp.float64, search: LineSearch
 
 @generated
 def lbfgs_kernels(scalar: Any) -> SimpleNamespace:
-    """Returns kernels for pairs, right-hand sides and solutions of type ``wp.float64`` or ``wp.float32``."""
-    module, vector = named_module(f"lbfgs.{scalar.__name__}"), wp.vec3d if scalar is wp.float64 else wp.vec3f
+    """Returns kernels for pairs, right-hand sides and solutions
+    of type ``wp.float64`` or ``wp.float32``.
+    """
+    module = named_module(f"lbfgs.{scalar.__name__}")
+    vector = wp.vec3d if scalar is wp.float64 else wp.vec3f
 
     @wp.struct
     class Pairs:
-        """Last pairs of displacement s and change of residual y, and R = triu(S Y^T); ring buffers of size M."""
+        """Last pairs of displacement s and change of residual y, and R = triu(S Y^T).
+
+        Ring buffers of size M.
+        """
 
         count: wp.array[int]  # (B)
         last: wp.array[int]  # (B) index of the newest pair
@@ -126,7 +141,10 @@ def lbfgs_kernels(scalar: Any) -> SimpleNamespace:
         pairs_out: Pairs,
         right_out: wp.array2d[vector],  # (B, F) g - Y^T a, with a = R^-1 S g
     ):
-        """Computes the right-hand side of the solve in compact L-BFGS form; zero where no direction is needed."""
+        """Computes the right-hand side of the solve in compact L-BFGS form.
+
+        Zero where no direction is needed.
+        """
         b, lane = wp.tid()
         if progress.phase[b] != NEED_DIRECTION:
             for p in range(lane, vertex_at.shape[0], wp.block_dim()):
@@ -147,7 +165,9 @@ def lbfgs_kernels(scalar: Any) -> SimpleNamespace:
                 value -= pairs_out.a[b, i] * wp.vec3d(pairs_out.y[b, place(pairs_out, b, i), v])
             right_out[b, p] = vector(value)
 
-    return SimpleNamespace(project=project, set_direction=_set_direction(Pairs, vector, module), Pairs=Pairs)
+    return SimpleNamespace(
+        project=project, set_direction=_set_direction(Pairs, vector, module), Pairs=Pairs
+    )
 
 
 def _set_direction(pairs_type: Any, vector: Any, module: wp.Module) -> Any:
@@ -163,7 +183,8 @@ def _set_direction(pairs_type: Any, vector: Any, module: wp.Module) -> Any:
     ):
         """Sets the direction, its slope and the first trial.
 
-        If the slope is positive or not finite, the pairs are deleted; without pairs a new factor is requested, once.
+        If the slope is positive or not finite, the pairs are deleted; without pairs a new factor is
+        requested, once.
         """
         b, lane = wp.tid()
         if progress_out.phase[b] != NEED_DIRECTION:

@@ -1,4 +1,5 @@
-"""Backtracking line search of a batch, the convergence test of accepted trials, and rounding errors.
+"""Backtracking line search of a batch, the convergence test
+of accepted trials, and rounding errors.
 
 Below the rounding errors of residual and state a minimisation makes no progress.
 """
@@ -44,7 +45,8 @@ def perturb(
     positions_out: wp.array2d[wp.vec3d],  # (B, N) [m]
     kept_out: wp.array2d[wp.vec3d],  # (B, N) copy of the unperturbed positions [m]
 ):
-    """Moves every coordinate by one rounding unit of the largest coordinate, where rounding is to be checked.
+    """Moves every coordinate by one rounding unit of the largest coordinate,
+    where rounding is to be checked.
 
     The largest coordinate counts because deformation gradients sum over coordinates of all sizes.
     """
@@ -69,7 +71,9 @@ def check_rounding(
     search_out: LineSearch,  # its positions are restored
     history_out: History,
 ):
-    """Marks an environment as converged if its residual is not larger than its change by the perturbation."""
+    """Marks an environment as converged if its residual is not larger
+    than its change by the perturbation.
+    """
     b, lane = wp.tid()
     if progress_out.check_rounding[b] == 0:
         return
@@ -103,7 +107,9 @@ def within_rounding(
     b: int,
     lane: int,
 ) -> bool:
-    """Returns whether the first step without loads, and the forces after it, are within the rounding of the state."""
+    """Returns whether the first step without loads, and the forces after it,
+    are within the rounding of the state.
+    """
     if iterations != 1 or progress.force[b] != wp.float64(0.0):
         return False
     moved, size, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
@@ -119,11 +125,18 @@ def within_rounding(
 
 @wp.func
 def decreases_enough(
-    before: wp.float64, energy: wp.float64, rounding: wp.float64, step: wp.float64, slope: wp.float64, after: wp.float64
+    before: wp.float64,
+    energy: wp.float64,
+    rounding: wp.float64,
+    step: wp.float64,
+    slope: wp.float64,
+    after: wp.float64,
 ) -> bool:
-    """Returns whether Armijo's condition holds or, within rounding, the approximate Wolfe condition.
+    """Returns whether Armijo's condition holds or, within rounding,
+    the approximate Wolfe condition.
 
-    Hager and Zhang (2005). ``slope`` and ``after`` are slopes of the energy along the direction, before and after.
+    Hager and Zhang (2005). ``slope`` and ``after`` are slopes of the energy along the direction,
+    before and after.
     """
     if energy <= before + ARMIJO * step * slope:
         return True
@@ -145,7 +158,10 @@ def backtrack(
     b: int,
     lane: int,
 ):
-    """Takes a trial of half the step; after the last one, goes back to the origin and abandons the search."""
+    """Takes a trial of half the step.
+
+    After the last one, goes back to the origin and abandons the search.
+    """
     half = HALF * step
     ends = halvings + 1 >= MAX_HALVINGS
     if ends:
@@ -155,7 +171,9 @@ def backtrack(
     at_rest = False
     if ends:
         scale = progress.scale[b]
-        at_rest = within_rounding(progress, tolerances, inertia, search, scale, progress.iterations[b], b, lane)
+        at_rest = within_rounding(
+            progress, tolerances, inertia, search, scale, progress.iterations[b], b, lane
+        )
     if lane == 0:
         progress.step[b] = half
         progress.halvings[b] = halvings + 1
@@ -183,7 +201,10 @@ def accept_kernel(scalar: Any) -> Any:
         pairs_out: pairs_type,
         history_out: History,
     ):
-        """Accepts a trial that decreases the energy enough, or halves the step; tests convergence."""
+        """Accepts a trial that decreases the energy enough, or halves the step.
+
+        Tests convergence.
+        """
         b, lane = wp.tid()
         phase = progress_out.phase[b]
         if phase != START and phase != LINE_SEARCH:
@@ -191,7 +212,9 @@ def accept_kernel(scalar: Any) -> Any:
         energy = evaluation.energy[b]
         norm = evaluation.norm[b]
         before = progress_out.energy[b]
-        flat = ENERGY_ROUNDING * (progress_out.stiffness[b] + wp.float64(100.0) * evaluation.size[b])
+        flat = ENERGY_ROUNDING * (
+            progress_out.stiffness[b] + wp.float64(100.0) * evaluation.size[b]
+        )
         iterations = progress_out.iterations[b]
         stalls = progress_out.stalls[b]
         if phase == LINE_SEARCH:
@@ -202,7 +225,18 @@ def accept_kernel(scalar: Any) -> Any:
             for i in range(lane, inertia.shape[1], wp.block_dim()):
                 after += wp.dot(evaluation.residual[b, i], search_out.direction[b, i])
             if not decreases_enough(before, energy, flat, step, slope, block_sum(after)):
-                backtrack(tolerances, inertia, clamped, progress_out, search_out, history_out, step, halvings, b, lane)
+                backtrack(
+                    tolerances,
+                    inertia,
+                    clamped,
+                    progress_out,
+                    search_out,
+                    history_out,
+                    step,
+                    halvings,
+                    b,
+                    lane,
+                )
                 return
             if keeps_pairs == 1:
                 add_pair(pairs_out, b, lane, step, search_out, evaluation.residual)
@@ -214,8 +248,11 @@ def accept_kernel(scalar: Any) -> Any:
             stalls = 0
         done = norm <= tolerances.relative * scale or norm <= tolerances.absolute
         done = done and norm + scale < INFINITE
-        done = done or within_rounding(progress_out, tolerances, inertia, search_out, scale, iterations, b, lane)
-        block_max(ZERO)  # A barrier: every thread has read the values of this environment before they are written.
+        done = done or within_rounding(
+            progress_out, tolerances, inertia, search_out, scale, iterations, b, lane
+        )
+        # A barrier: every thread has read the values of this environment before they are written.
+        block_max(ZERO)
         if done:
             record_solution(history_out, search_out.positions, b, lane)
         if lane == 0:

@@ -1,14 +1,15 @@
-"""Functions of one 3x3 matrix: cofactor, polar rotation, signed SVD, and the tangent of an isotropic energy."""
+"""Functions of one 3x3 matrix: cofactor, polar rotation,
+signed SVD, and the tangent of an isotropic energy.
+"""
 
 import warp as wp
 
-# Squared norms of the last update at which an iteration has converged to rounding: Newton's is of second order,
-# Halley's of third.
+# Squared norms of the last update at which an iteration has converged to rounding: Newton's is of
+# second order, Halley's of third.
 NEWTON_TOLERANCE, HALLEY_TOLERANCE = wp.float64(1.0e-16), wp.float64(1.0e-11)
 HALLEY_ITERATIONS = 12
-LARGEST_TRACE = wp.float64(
-    12.0
-)  # of F^T F, up to which invariants give rotations as exact as iterations of matrices do
+# Of F^T F, up to which invariants give rotations as exact as iterations of matrices do.
+LARGEST_TRACE = wp.float64(12.0)
 SMALLEST_STRETCH_SUM = wp.float64(1.0e-3)  # lower bound of sums of stretches in denominators
 SINGULAR, ROUNDING = wp.float64(1.0e-12), wp.float64(1.0e-32)
 ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
@@ -31,7 +32,15 @@ def cofactor(a: wp.mat33d) -> wp.mat33d:
 
 
 @wp.func
-def annul(p: wp.float64, q: wp.float64, pq: wp.float64, rp: wp.float64, rq: wp.float64, vp: wp.vec3d, vq: wp.vec3d):
+def annul(
+    p: wp.float64,
+    q: wp.float64,
+    pq: wp.float64,
+    rp: wp.float64,
+    rq: wp.float64,
+    vp: wp.vec3d,
+    vq: wp.vec3d,
+):
     """Applies Jacobi's rotation of axes p and q that makes the entry pq of a symmetric matrix zero.
 
     Returns the entries pp, qq, rp and rq, with r the third axis, and the vectors of the two axes.
@@ -42,12 +51,21 @@ def annul(p: wp.float64, q: wp.float64, pq: wp.float64, rp: wp.float64, rq: wp.f
         t = pq / (half + wp.where(half < ZERO, -ONE, ONE) * wp.sqrt(half * half + pq * pq))
     c = ONE / wp.sqrt(ONE + t * t)
     s = t * c
-    return p - t * pq, q + t * pq, c * rp - s * rq, s * rp + c * rq, c * vp - s * vq, s * vp + c * vq
+    return (
+        p - t * pq,
+        q + t * pq,
+        c * rp - s * rq,
+        s * rp + c * rq,
+        c * vp - s * vq,
+        s * vp + c * vq,
+    )
 
 
 @wp.func
 def symmetric_eigen(a: wp.mat33d):
-    """Returns V, det V = 1, and e of A = V diag(e) V^T, in no order (Golub and Van Loan 2013, section 8.5)."""
+    """Returns V, det V = 1, and e of A = V diag(e) V^T,
+    in no order (Golub and Van Loan 2013, section 8.5).
+    """
     x, y, z, xy, xz, yz = a[0, 0], a[1, 1], a[2, 2], a[0, 1], a[0, 2], a[1, 2]
     i, j, k = wp.vec3d(ONE, ZERO, ZERO), wp.vec3d(ZERO, ONE, ZERO), wp.vec3d(ZERO, ZERO, ONE)
     small = ROUNDING * wp.ddot(a, a)
@@ -63,20 +81,28 @@ def symmetric_eigen(a: wp.mat33d):
 
 @wp.func
 def general_svd(f: wp.mat33d):
-    """Returns U, s and V of F = U diag(s) V^T, det U = det V = 1; the smallest s carries the sign of det F."""
+    """Returns U, s and V of F = U diag(s) V^T, det U = det V = 1.
+
+    The smallest s carries the sign of det F.
+    """
     u, s, v = wp.svd3(f)
     if wp.determinant(u) < ZERO:
-        u = wp.mat33d(u[0, 0], u[0, 1], -u[0, 2], u[1, 0], u[1, 1], -u[1, 2], u[2, 0], u[2, 1], -u[2, 2])
+        u = wp.mat33d(
+            u[0, 0], u[0, 1], -u[0, 2], u[1, 0], u[1, 1], -u[1, 2], u[2, 0], u[2, 1], -u[2, 2]
+        )
         s = wp.vec3d(s[0], s[1], -s[2])
     if wp.determinant(v) < ZERO:
-        v = wp.mat33d(v[0, 0], v[0, 1], -v[0, 2], v[1, 0], v[1, 1], -v[1, 2], v[2, 0], v[2, 1], -v[2, 2])
+        v = wp.mat33d(
+            v[0, 0], v[0, 1], -v[0, 2], v[1, 0], v[1, 1], -v[1, 2], v[2, 0], v[2, 1], -v[2, 2]
+        )
         s = wp.vec3d(s[0], s[1], -s[2])
     return u, s, v
 
 
 @wp.func
 def newton_rotation(f: wp.mat33d):
-    """Returns R by Newton's iteration R <- (R + R^-T) / 2 from R = F (Higham 1986), and whether it converged.
+    """Returns R by Newton's iteration R <- (R + R^-T) / 2 from R = F (Higham 1986),
+    and whether it converged.
 
     It does not where F is inverted or too flat.
     """
@@ -106,7 +132,9 @@ def polar_rotation(f: wp.mat33d) -> wp.mat33d:
 
 @wp.func
 def signed_svd(f: wp.mat33d):
-    """Returns U, s and V of F = U diag(s) V^T, det U = det V = 1; if det F < 0, the last and smallest s is negative.
+    """Returns U, s and V of F = U diag(s) V^T, det U = det V = 1.
+
+    If det F < 0, the last and smallest s is negative.
 
     By the eigenvectors of the symmetric factor of F = R S, in half the time of a general one.
     """
@@ -119,12 +147,14 @@ def signed_svd(f: wp.mat33d):
     return r * v, s, v
 
 
-# In the frame of the SVD F = U diag(s) V^T, with dF' = U^T dF V, the tangent of an isotropic energy is
+# In the frame of the SVD F = U diag(s) V^T, with dF' = U^T dF V, the tangent of an isotropic energy
+# is
 #   dP'_ij = direct_ij dF'_ij + cross_ij dF'_ji            (i != j)
 #   dP'_ii = direct_ii dF'_ii + sum_{k != i} normal_ik dF'_kk
-# with direct = (flip + twist) / 2 and cross = (flip - twist) / 2 off the diagonal, where flip and twist are the
-# eigenvalues (sigma_i - sigma_j) / (s_i - s_j) and (sigma_i + sigma_j) / (s_i + s_j) of the symmetric and skew
-# pairs (Smith, de Goes, Kim 2019), written so that equal singular values do not divide by zero.
+# with direct = (flip + twist) / 2 and cross = (flip - twist) / 2 off the diagonal, where flip and
+# twist are the eigenvalues (sigma_i - sigma_j) / (s_i - s_j) and (sigma_i + sigma_j) / (s_i + s_j)
+# of the symmetric and skew pairs (Smith, de Goes, Kim 2019), written so that equal singular values
+# do not divide by zero.
 @wp.func
 def spectral_blocks(
     u: wp.mat33d,
@@ -135,7 +165,8 @@ def spectral_blocks(
     clamp: bool,
     out: wp.array[wp.mat33d],
 ):
-    """Writes the six blocks, with `clamp` those of the nearest tangent without negative eigenvalues.
+    """Writes the six blocks, with `clamp` those of the nearest tangent
+    without negative eigenvalues.
 
     The index of `flip` and `twist` is the axis that is not in their pair.
     """
@@ -157,7 +188,8 @@ def spectral_blocks(
                 cross[i, j] = HALF * (flip[axis] - twist[axis])
     for k in range(3):
         for n in range(k + 1):
-            # A unit change of column n of F along u_j is e_j v_n^T in the frame, v_n being row n of V.
+            # A unit change of column n of F along u_j is e_j v_n^T in the frame, v_n being row n of
+            # V.
             diagonal = direct * wp.cw_mul(v[k], v[n])
             block = wp.cw_mul(normal, wp.outer(v[k], v[n])) + wp.cw_mul(cross, wp.outer(v[n], v[k]))
             block[0, 0] = diagonal[0]

@@ -1,19 +1,21 @@
 """State machine of the minimisations of a batch, on the device.
 
-One block of threads works on one environment. Every environment has its own phase, so that none waits for the line
-search of another:
+One block of threads works on one environment. Every environment has its own phase, so that none
+waits for the line search of another:
 
-==============  ========================================================================================
+==============  ==============================================================================
 START           the starting point is evaluated next
-NEED_DIRECTION  next: `lbfgs.project`, a solve with the matrix of the global step, `lbfgs.set_direction`
-LINE_SEARCH     the positions are a trial, which is evaluated next and tested by `line_search.accept`
+NEED_DIRECTION  next: `lbfgs.project`, a solve with the matrix of the global step,
+                `lbfgs.set_direction`
+LINE_SEARCH     the positions are a trial, which is evaluated next and tested by
+                `line_search.accept`
 DONE            the environment has converged
 FAILED          the environment has not converged and gets no further step
-==============  ========================================================================================
+==============  ==============================================================================
 
-A solve begins at an extrapolation. The correction of a step is its solution less the position where inertia alone would
-lead; it is extrapolated by one step with the polynomial through the last corrections: none, a constant, a line or a
-parabola.
+A solve begins at an extrapolation. The correction of a step is its solution less the position where
+inertia alone would lead; it is extrapolated by one step with the polynomial through the last
+corrections: none, a constant, a line or a parabola.
 """
 
 import warp as wp
@@ -29,7 +31,8 @@ STALLS_BEFORE_CHECK = wp.constant(3)
 STALLS_BETWEEN_CHECKS = wp.constant(16)  # a single perturbation may happen to change little
 
 INFINITE = wp.constant(wp.float64(float("inf")))
-# A higher order, which amplifies fast modes, is used only if it reduces the squared error to this fraction.
+# A higher order, which amplifies fast modes, is used only if it reduces the squared error to this
+# fraction.
 IMPROVEMENT = wp.constant(wp.float64(0.1))
 ONE = wp.float64(1.0)
 
@@ -39,7 +42,7 @@ class SolverProgress:
     """State of the solver, (B) each."""
 
     phase: wp.array[int]
-    request: wp.array[int]  # 0, FACTOR or CLAMPED_FACTOR: factorisation needed before the next direction
+    request: wp.array[int]  # 0, FACTOR or CLAMPED_FACTOR: needed before the next direction
     factored: wp.array[int]  # 1: a factor exists, of this solve or an earlier one
     check_rounding: wp.array[int]  # 1: measure next whether the residual is rounding error
     iterations: wp.array[int]  # directions of this solve; before its start, those of the last solve
@@ -53,7 +56,7 @@ class SolverProgress:
     scale: wp.array[wp.float64]  # norm of the balancing forces at the iterate [N]
     relative: wp.array[wp.float64]  # residual over scale
     smallest_norm: wp.array[wp.float64]  # smallest norm of a residual so far [N]
-    rounding: wp.array[wp.float64]  # measured rounding error of the residual, infinite before a measurement [N]
+    rounding: wp.array[wp.float64]  # measured error of the residual, infinite before that [N]
     force: wp.array[wp.float64]  # norm of the loads [N]
     stiffness: wp.array[wp.float64]  # sum over all points [J]
 
@@ -123,7 +126,9 @@ def extrapolated(history: History, b: int, i: int, order: int) -> wp.vec3d:
 
 @wp.func
 def record_solution(history: History, positions: wp.array2d[wp.vec3d], b: int, lane: int):
-    """Stores the correction of a solution, and selects the order whose extrapolation was closest to it."""
+    """Stores the correction of a solution, and selects the order
+    whose extrapolation was closest to it.
+    """
     lanes = wp.block_dim()
     n = positions.shape[1]
     count = history.stored[b]
@@ -153,10 +158,12 @@ def begin(
     force: wp.array2d[wp.vec3d],  # (B, N) [N]
     stiffness: wp.array[wp.float64],  # (B) sum over the solids' points [J]
     progress_out: SolverProgress,
-    search_out: LineSearch,  # its positions are where inertia alone would lead, and become the start
+    search_out: LineSearch,  # positions are where inertia alone leads, and become the start
     history_out: History,
 ):
-    """Sets the extrapolated starting point, and sums the quantities that stay constant during this solve."""
+    """Sets the extrapolated starting point, and sums the quantities
+    that stay constant during this solve.
+    """
     b, lane = wp.tid()
     square = wp.float64(0.0)
     count = history_out.stored[b]
@@ -191,9 +198,14 @@ def begin(
 
 @wp.kernel
 def select_for_factorisation(
-    progress_out: SolverProgress, pairs_out: wp.array[int], active_out: wp.array[int], clamp_out: wp.array[int]
+    progress_out: SolverProgress,
+    pairs_out: wp.array[int],
+    active_out: wp.array[int],
+    clamp_out: wp.array[int],
 ):
-    """Selects the environments to factorise next, clamped or not, and deletes their L-BFGS pairs."""
+    """Selects the environments to factorise next, clamped or not,
+    and deletes their L-BFGS pairs.
+    """
     b = wp.tid()
     request = progress_out.request[b]
     selected = progress_out.phase[b] == NEED_DIRECTION and request > 0
@@ -221,7 +233,10 @@ def mark_clamped(
 
 @wp.kernel
 def request_clamped(active: wp.array[int], clamp_out: wp.array[int], count_out: wp.array[int]):
-    """Requests clamping for all active environments, and counts them; launched as a single block."""
+    """Requests clamping for all active environments, and counts them.
+
+    Launched as a single block.
+    """
     _, lane = wp.tid()
     count = wp.float64(0.0)
     for b in range(lane, active.shape[0], wp.block_dim()):
@@ -235,7 +250,10 @@ def request_clamped(active: wp.array[int], clamp_out: wp.array[int], count_out: 
 
 @wp.kernel
 def summarise(progress: SolverProgress, summary_out: wp.array[int], active_out: wp.array[int]):
-    """Counts environments for the host, and sets (B) which need a further evaluation; launched as a single block."""
+    """Counts environments for the host, and sets (B) which need a further evaluation.
+
+    Launched as a single block.
+    """
     _, lane = wp.tid()
     active, directions = wp.float64(0.0), wp.float64(0.0)
     factors, checks = wp.float64(0.0), wp.float64(0.0)
@@ -249,12 +267,10 @@ def summarise(progress: SolverProgress, summary_out: wp.array[int], active_out: 
             directions += ONE
             if progress.request[b] > 0:
                 factors += ONE
-    active, directions, factors, checks = (
-        block_sum(active),
-        block_sum(directions),
-        block_sum(factors),
-        block_sum(checks),
-    )
+    active = block_sum(active)
+    directions = block_sum(directions)
+    factors = block_sum(factors)
+    checks = block_sum(checks)
     if lane == 0:
         summary_out[0] = int(active)
         summary_out[1] = int(directions)
@@ -275,14 +291,20 @@ def begin_search(progress: SolverProgress, slope: wp.float64, b: int):
 
 @wp.func
 def may_be_rounding(progress: SolverProgress, b: int, norm: wp.float64, stalls: int) -> bool:
-    """Returns whether to measure the rounding error of a stalled residual: once, and again every few stalls."""
+    """Returns whether to measure the rounding error of a stalled residual:
+    once, and again every few stalls.
+    """
     stuck = progress.iterations[b] >= STALLS_BEFORE_CHECK and stalls >= STALLS_BEFORE_CHECK
     return stuck and (norm <= progress.rounding[b] or stalls % STALLS_BETWEEN_CHECKS == 0)
 
 
 @wp.func
-def abandon_search(progress: SolverProgress, tolerances: Tolerances, clamped: wp.array[wp.bool], b: int):
-    """Ends a failed line search: requests a new factor, then a clamped one, before the environment counts as failed."""
+def abandon_search(
+    progress: SolverProgress, tolerances: Tolerances, clamped: wp.array[wp.bool], b: int
+):
+    """Ends a failed line search: requests a new factor, then a clamped one,
+    before the environment counts as failed.
+    """
     progress.phase[b] = NEED_DIRECTION
     progress.stalls[b] += 1
     norm = progress.relative[b] * wp.max(progress.scale[b], tolerances.absolute)
@@ -313,7 +335,9 @@ def accept_trial(
     norm = evaluation.norm[b]
     relative = norm / wp.max(scale, tolerances.absolute)
     is_flat = progress.energy[b] - evaluation.energy[b] <= flat
-    progress.check_rounding[b] = int(may_be_rounding(progress, b, norm, stalls) and is_flat and not converged)
+    progress.check_rounding[b] = int(
+        may_be_rounding(progress, b, norm, stalls) and is_flat and not converged
+    )
     progress.stalls[b] = stalls
     progress.energy[b] = evaluation.energy[b]
     progress.scale[b] = scale

@@ -1,7 +1,8 @@
-"""Named Warp modules, which are compiled only if used, the streams of launches, and Warp in several threads.
+"""Named Warp modules, which are compiled only if used,
+the streams of launches, and Warp in several threads.
 
-Warp's settings, modules and captures are global to the process: while a thread makes kernels, records a launch or
-captures a graph, no other one may launch.
+Warp's settings, modules and captures are global to the process: while a thread makes kernels,
+records a launch or captures a graph, no other one may launch.
 """
 
 import functools
@@ -33,7 +34,9 @@ def generated(make: Callable[..., T]) -> Callable[..., T]:
 
 
 def named_module(part: str) -> wp.Module:
-    """Returns the Warp module of kernels that are generated per law or per type, without Warp's own adjoints."""
+    """Returns the Warp module of kernels that are generated per law or per type,
+    without Warp's own adjoints.
+    """
     module = wp.get_module(f"{__package__}.{part}")
     wp.set_module_options({"enable_backward": False}, module)
     return module
@@ -41,10 +44,11 @@ def named_module(part: str) -> wp.Module:
 
 @contextmanager
 def shareable() -> Iterator[None]:
-    """Lets one thread at a time load Warp modules, such that several CPU threads may launch their kernels concurrently.
+    """Lets one thread at a time load Warp modules, such
+    that several CPU threads may launch their kernels concurrently.
 
-    By default every launch registers its tile memory, which these kernels do not use, in a variable shared by all
-    threads.
+    By default every launch registers its tile memory, which these kernels do not use, in a variable
+    shared by all threads.
     """
     with _WARP:
         before = wp.config.enable_tiles_in_stack_memory
@@ -75,7 +79,8 @@ def _compile_together(modules: tuple[Any, ...], device: str, block: int) -> None
 class RecordedLaunch:
     """A recorded launch of Warp, which waits while another thread captures.
 
-    Locks would cost several percent of a step: threads enter themselves in a list, in one instruction of Python.
+    Locks would cost several percent of a step: threads enter themselves in a list, in one
+    instruction of Python.
     """
 
     _running: Final = list[None]()  # an entry for every launch
@@ -119,7 +124,9 @@ class RecordedLaunch:
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_WARP.acquire, after_in_parent=_WARP.release, after_in_child=RecordedLaunch.forked)
+    os.register_at_fork(
+        before=_WARP.acquire, after_in_parent=_WARP.release, after_in_child=RecordedLaunch.forked
+    )
 
 
 def launch_stream(device: torch.device) -> Any:
@@ -134,5 +141,8 @@ def launch_stream(device: torch.device) -> Any:
 
 @functools.cache
 def _stream(device: str, handle: int) -> Any:
-    """Returns a stream; cached, as Warp unregisters a stream with its object, and torch reuses a few."""
+    """Returns a stream.
+
+    Cached, as Warp unregisters a stream with its object, and torch reuses a few.
+    """
     return wp.Stream(device, cuda_stream=handle)

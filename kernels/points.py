@@ -1,8 +1,9 @@
 """Kernels shared by the points of all energies: kinematics, gather, product with a tangent.
 
-A point has an operator g_a for each of its nodes. Either g_a is a vector, and the energy is a function of the matrix
-F = sum_a x_a g_a^T, such as a deformation gradient; or g_a is a number, and the energy is a function of the vector
-sum_a g_a x_a, such as a fibre or a position. The stress has the shape of the argument of the energy.
+A point has an operator g_a for each of its nodes. Either g_a is a vector, and the energy is a
+function of the matrix F = sum_a x_a g_a^T, such as a deformation gradient; or g_a is a number, and
+the energy is a function of the vector sum_a g_a x_a, such as a fibre or a position. The stress has
+the shape of the argument of the energy.
 """
 
 from types import SimpleNamespace
@@ -66,7 +67,7 @@ def green_strain(f: wp.mat33d) -> wp.mat33d:
 
 @wp.struct
 class PartValues:
-    """Weights of points, and the values at each of them, which are parts of any number of arrays."""
+    """Weights of points, and values at each of them, which are parts of any number of arrays."""
 
     weights: wp.array[wp.float64]  # (P)
     addresses: wp.array[wp.uint64]  # of float64 arrays (B, size)
@@ -112,7 +113,9 @@ def vector_product(t: wp.array[wp.mat33d], dx: wp.vec3d) -> wp.vec3d:
 
 @generated
 def set_kernels(width: int) -> SimpleNamespace:
-    """Returns kernels from stresses to forces and from tangents to stresses, for operators of a width of 1 or 3."""
+    """Returns kernels from stresses to forces and from tangents to stresses,
+    for operators of a width of 1 or 3.
+    """
     module = named_module(f"points.{width}")
     points_type, shape = (VectorPoints, wp.vec3d) if width == 1 else (MatrixPoints, wp.mat33d)
     see, product = (vector_at, vector_product) if width == 1 else (matrix_at, matrix_product)
@@ -121,7 +124,7 @@ def set_kernels(width: int) -> SimpleNamespace:
     def gather(
         points: points_type,
         incident_start: wp.array[int],  # (N + 1) first entry of each vertex
-        incident: wp.array[int],  # cell * K + local node, cells in ascending order: a fixed summation order
+        incident: wp.array[int],  # cell * K + node, cells ascending: a fixed summation order
         stress: wp.array2d[shape],
         force_out: wp.array2d[wp.vec3d],  # (B, N) [N], added to
     ):
@@ -144,7 +147,10 @@ def set_kernels(width: int) -> SimpleNamespace:
         stress: wp.array2d[shape],
         force_out: wp.array2d[wp.vec3d],  # (B, C K) [N]
     ):
-        """Applies the transposed operator to the stress, per cell and local node; `gather_cells` sums the results."""
+        """Applies the transposed operator to the stress, per cell and local node.
+
+        `gather_cells` sums the results.
+        """
         b, entry = wp.tid()
         if active[b] == 0:
             return

@@ -1,7 +1,8 @@
-"""Reductions over an environment by one block of threads: one thread on a CPU, ``block_dim`` threads on a GPU.
+"""Reductions over an environment by one block of threads:
+one thread on a CPU, ``block_dim`` threads on a GPU.
 
-Threads stride over the vertices or points. The summation order depends only on the device, never on timing. Every
-thread of the block must reach a reduction, which is also a barrier.
+Threads stride over the vertices or points. The summation order depends only on the device, never on
+timing. Every thread of the block must reach a reduction, which is also a barrier.
 """
 
 import warp as wp
@@ -53,7 +54,9 @@ def totals(
     size_out: wp.array[wp.float64],  # (B) sum of the energies' absolute values [J]
     norm_out: wp.array[wp.float64],  # (B) of the residual [N]
 ):
-    """Sums the energy and the norm of the residual, for the line search and the convergence test."""
+    """Sums the energy and the norm of the residual,
+    for the line search and the convergence test.
+    """
     b, lane = wp.tid()
     energy, size, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
     for i in range(lane, free.shape[0], wp.block_dim()):

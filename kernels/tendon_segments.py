@@ -1,10 +1,11 @@
 """Tendons through guides: stress, tangent, and which guides slide.
 
-A point is the segment of a tendon between two guides. The first column of F = sum_a x_a g_a^T is the vector from one
-guide to the next; the other two are its changes as the guides move in the body along the tendon's two offset
-directions, per `OFFSET_UNIT`. So a segment is F c, with c = (1, offsets in that unit). The tension at the first guide
-is the commanded one plus that of a tension-only spring, stretched by the tendon's length in excess of its free length.
-The guide before each segment adds the friction of `bristle`, which depends on the length of the tendon beyond it.
+A point is the segment of a tendon between two guides. The first column of F = sum_a x_a g_a^T is
+the vector from one guide to the next; the other two are its changes as the guides move in the body
+along the tendon's two offset directions, per `OFFSET_UNIT`. So a segment is F c, with
+c = (1, offsets in that unit). The tension at the first guide is the commanded one plus that of a
+tension-only spring, stretched by the tendon's length in excess of its free length. The guide before
+each segment adds the friction of `bristle`, which depends on the length of the tendon beyond it.
 """
 
 import warp as wp
@@ -15,7 +16,9 @@ from .points import MatrixPoints, matrix_at
 wp.set_module_options({"enable_backward": False})
 
 ZERO, ONE = wp.float64(0.0), wp.float64(1.0)
-OFFSET_UNIT = 5e-3  # unit of the offsets [m], about a cell size, so that the columns of F have similar norms
+OFFSET_UNIT = (
+    5e-3  # unit of the offsets [m], about a cell size, so that the columns of F have similar norms
+)
 
 
 @wp.func
@@ -30,20 +33,32 @@ def direction_of(line: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def segment(
-    points: MatrixPoints, positions: wp.array2d[wp.vec3d], anchors: wp.array[wp.mat33d], b: int, p: int
+    points: MatrixPoints,
+    positions: wp.array2d[wp.vec3d],
+    anchors: wp.array[wp.mat33d],
+    b: int,
+    p: int,
 ) -> wp.mat33d:
     """Returns F of a segment; ends that are fixed in the world are in ``anchors`` (P)."""
     return matrix_at(points, positions, b, p) + anchors[p]
 
 
 @wp.func
-def bristle(slide: wp.float64, hold: wp.float64, drop: wp.float64, rise: wp.float64, length: wp.float64):
-    """Returns energy, force and slope of a guide's friction after a slide (``energies.tendon_forces``)."""
+def bristle(
+    slide: wp.float64, hold: wp.float64, drop: wp.float64, rise: wp.float64, length: wp.float64
+):
+    """Returns energy, force and slope of a guide's friction after a slide
+    (``energies.tendon_forces``).
+    """
     size, start, most, sign = slide, hold, rise, ONE
     if slide < ZERO:
         size, start, most, sign = -slide, -hold, drop, -ONE
     left = (start - most) * wp.exp(-size / length)
-    return most * size + length * (start - most - left), sign * (most + left), wp.max(-left / length, ZERO)
+    return (
+        most * size + length * (start - most - left),
+        sign * (most + left),
+        wp.max(-left / length, ZERO),
+    )
 
 
 @wp.kernel
@@ -58,15 +73,15 @@ def pull(
     commanded: wp.array2d[wp.float64],  # (B, T) tension [N]
     contraction: wp.array2d[wp.float64],  # (B, T) [m]
     stiffness: wp.array2d[wp.float64],  # (B, T) of the spring [N/m]
-    hold: wp.array2d[wp.float64],  # (B, P) friction of the guide before each segment at the step's start [N]
+    hold: wp.array2d[wp.float64],  # (B, P) friction of the guide before each at the start [N]
     drop: wp.array2d[wp.float64],  # (B, P) its bounds, downwards and upwards [N]
     rise: wp.array2d[wp.float64],
-    beyond: wp.array2d[wp.float64],  # (B, P) length of the tendon beyond that guide at the step's start [m]
+    beyond: wp.array2d[wp.float64],  # (B, P) tendon beyond that guide at the start [m]
     bristles: wp.array2d[wp.float64],  # (B, T) bristle length [m]
     positions: wp.array2d[wp.vec3d],
     tension_out: wp.array2d[wp.float64],  # (B, P) of each segment [N]
-    spring_out: wp.array2d[wp.vec3d],  # (B, T) energy, force and slope of a spring of stiffness one [m^2, m, -]
-    friction_out: wp.array2d[wp.vec3d],  # (B, P) energy [J], slide [m] and slope [N/m] of the friction before it
+    spring_out: wp.array2d[wp.vec3d],  # (B, T) energy, force, slope at stiffness one [m^2, m, -]
+    friction_out: wp.array2d[wp.vec3d],  # (B, P) energy [J], slide [m], slope [N/m] before it
 ):
     """Computes spring, friction and tensions of each tendon."""
     b, t = wp.tid()
@@ -109,7 +124,10 @@ def local_step(
     stress_out: wp.array2d[wp.mat33d],
     energy_out: wp.array2d[wp.float64],
 ):
-    """Computes T L of the commanded tension and friction; the first segment also has the spring's energy."""
+    """Computes T L of the commanded tension and friction.
+
+    The first segment also has the spring's energy.
+    """
     b, p = wp.tid()
     if active[b] == 0:
         return
@@ -135,9 +153,12 @@ def tangent(
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],
 ):
-    """Computes blocks (i, j), c_i c_j T / l (1 - u u^T), at constant tension; its change couples segments at low rank.
+    """Computes blocks (i, j), c_i c_j T / l (1 - u u^T), at constant tension.
 
-    Friction makes a tension negative only where that at the first guide fell by more than itself within the step.
+    Its change couples segments at low rank.
+
+    Friction makes a tension negative only where that at the first guide fell by more than itself
+    within the step.
     """
     b, p = wp.tid()
     if active[b] == 0:
@@ -163,9 +184,12 @@ def stick(
     begin: wp.array2d[wp.float64],  # (B, T) tension before the first guide [N]
     segments: wp.array2d[wp.float64],  # (B, P) tension of each segment so far [N]
     growth: wp.array2d[wp.float64],  # (B, P) exp(mu theta) of the guide before it
-    slides_out: wp.array2d[int],  # (B, P) -1 and 1 where that guide slides, so that the tension falls or rises there
+    slides_out: wp.array2d[int],  # (B, P) -1, 1 where it slides: the tension falls or rises
 ):
-    """Lets every guide stick, or slide as far as its bounds ask for; guides without contact slide."""
+    """Lets every guide stick, or slide as far as its bounds ask for.
+
+    Guides without contact slide.
+    """
     b, t = wp.tid()
     before = wp.float64(begin[b, t])
     for p in range(first[t], first[t + 1]):

@@ -1,15 +1,18 @@
-"""Cholesky factorisation of banded matrices in square tiles, and both sweeps of a solve: one block per matrix.
+"""Cholesky factorisation of banded matrices in square tiles,
+and both sweeps of a solve: one block per matrix.
 
-A matrix of n unknowns is stored by rows: row i holds the W + 1 tiles of T columns that end with its diagonal tile, so
-that entry (i, j) of the lower triangle is at column (j // T - i // T + W) T + j % T. Tiles left of the first column and
-entries above the diagonal are never read. Rows beyond n in the last tile are those of a unit matrix.
+A matrix of n unknowns is stored by rows: row i holds the W + 1 tiles of T columns that end with its
+diagonal tile, so that entry (i, j) of the lower triangle is at column (j // T - i // T + W) T + j %
+T. Tiles left of the first column and entries above the diagonal are never read. Rows beyond n in
+the last tile are those of a unit matrix.
 
-The factorisation is left-looking by columns of tiles (Golub and Van Loan 2013, section 4.2.9). The inverse of each
-diagonal tile of the factor is stored instead of the tile: a sweep multiplies by it instead of a sequential
-substitution.
+The factorisation is left-looking by columns of tiles (Golub and Van Loan 2013, section 4.2.9). The
+inverse of each diagonal tile of the factor is stored instead of the tile: a sweep multiplies by it
+instead of a sequential substitution.
 
-Threads of a block share tiles and synchronise. Warp's own tiles do so through libraries that take two minutes to
-compile for every type; these few lines of C++ also compile for a CPU, where a block is one thread.
+Threads of a block share tiles and synchronise. Warp's own tiles do so through libraries that take
+two minutes to compile for every type; these few lines of C++ also compile for a CPU, where a block
+is one thread.
 """
 
 from types import SimpleNamespace
@@ -33,7 +36,8 @@ _SHARED: Final = f"""
     constexpr int LANES = {BLOCK};  // The block's; Q of them work on a row of a tile.
     constexpr int Q = LANES / T;
     const int lane = threadIdx.x;
-    #define RESPHYS_SUM(v) for (int o = Q / 2; o > 0; o /= 2) v += __shfl_xor_sync(0xffffffffu, v, o);
+    #define RESPHYS_SUM(v) \\
+        for (int o = Q / 2; o > 0; o /= 2) v += __shfl_xor_sync(0xffffffffu, v, o);
     #define RESPHYS_ANY(v) __syncthreads_or(v)
 #else
     #define RESPHYS_SHARED
@@ -57,7 +61,8 @@ _FACTOR: Final = (
     S* const all = matrix_out.data;
     const int stride = matrix_out.shape[1], tiles = matrix_out.shape[0] / T, width = stride / T - 1;
     for (int j = 0; j < tiles; ++j) {
-        const int below = (tiles - j - 1 < width ? tiles - j - 1 : width);  // tiles of this column under the diagonal
+        // Tiles of this column under the diagonal.
+        const int below = (tiles - j - 1 < width ? tiles - j - 1 : width);
         // What the columns before leave of this one, in pieces of 4 x 4 entries.
         for (int piece = lane; piece < (below + 1) * 16; piece += LANES) {
             const int i = j + piece / 16, r = piece % 16 / 4 * 4, c = piece % 4 * 4;
@@ -142,7 +147,8 @@ _SOLVE: Final = (
     if (!RESPHYS_ANY(some)) return;  // A zero right-hand side: the environment needs no direction.
     int early = 0;
     for (int c = lane; c < T && c < n; c += LANES) early |= (x[c] != S(0));
-    const bool sparse = !RESPHYS_ANY(early);  // Such as a column of a unit matrix: tiles of zeros are skipped.
+    // Such as a column of a unit matrix: tiles of zeros are skipped.
+    const bool sparse = !RESPHYS_ANY(early);
     for (int i = 0; i < tiles; ++i) {
         const int first = (i > width ? i - width : 0) * T;
         if (sparse) {
@@ -219,10 +225,13 @@ def tiled_kernels(scalar: Any) -> SimpleNamespace:
     @wp.kernel(module=module)
     def clear(
         active: wp.array[int],  # (B) zero: skip the environment
-        unit: wp.array[scalar],  # (n rounded up to tiles times (W + 1) T) zero, but one on the diagonal beyond n
+        unit: wp.array[scalar],  # (whole tiles times (W + 1) T) zero, one on the diagonal beyond n
         matrices_out: wp.array2d[scalar],  # (B, length of unit)
     ):
-        """Resets active matrices; one block per matrix, as one thread per entry would be slow for inactive ones."""
+        """Resets active matrices.
+
+        One block per matrix, as one thread per entry would be slow for inactive ones.
+        """
         b, lane = wp.tid()
         if active[b] != 0:
             for k in range(lane, unit.shape[0], wp.block_dim()):
@@ -232,7 +241,7 @@ def tiled_kernels(scalar: Any) -> SimpleNamespace:
     def check(
         clamped: wp.array[wp.bool],  # (B) matrices with clamped eigenvalues
         active_out: wp.array[int],  # (B) becomes zero, except for unclamped matrices that failed
-        factors_out: wp.array3d[scalar],  # (B, n rounded up to tiles, (W + 1) T) NaN where clamped matrices failed
+        factors_out: wp.array3d[scalar],  # (B, whole tiles, (W + 1) T) NaN where clamped failed
     ):
         """Finds matrices that were not positive definite, one block per matrix."""
         b, lane = wp.tid()
@@ -254,7 +263,7 @@ def tiled_kernels(scalar: Any) -> SimpleNamespace:
     @wp.kernel(module=module)
     def factor(
         active: wp.array[int],  # (B) zero: skip the environment
-        matrices_out: wp.array3d[scalar],  # (B, n rounded up to tiles, (W + 1) T) overwritten by the factors
+        matrices_out: wp.array3d[scalar],  # (B, n to whole tiles, (W + 1) T) overwritten by factors
     ):
         b, _ = wp.tid()
         if active[b] != 0:

@@ -7,7 +7,8 @@ from .points import MatrixPoints, matrix_at
 
 wp.set_module_options({"enable_backward": False})
 
-SMALLEST = wp.constant(wp.float64(1.0e-30))  # of determinants; gradients are scaled by the mean volume of cells
+# Of determinants; gradients are scaled by the mean volume of cells.
+SMALLEST = wp.constant(wp.float64(1.0e-30))
 THIRD, ONE = wp.float64(1.0 / 3.0), wp.float64(1.0)
 
 
@@ -76,7 +77,9 @@ def straighten(
     arms: wp.array2d[wp.vec3d],  # (P, 4) from there to the control vertices at rest [m]
     positions_out: wp.array2d[wp.vec3d],
 ):
-    """Replaces the deformation gradient of every part by its rotation, with the centre of mass in its place."""
+    """Replaces the deformation gradient of every part by its rotation,
+    with the centre of mass in its place.
+    """
     b, p = wp.tid()
     r = polar_rotation(matrix_at(points, positions_out, b, p))
     middle = wp.vec3d()

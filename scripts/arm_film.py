@@ -1,4 +1,5 @@
-"""The film docs/films/pick_and_place.mp4: an arm with a gripper of two soft fingers picks a ball and places it.
+"""The film docs/films/pick_and_place.mp4: an arm with a gripper
+of two soft fingers picks a ball and places it.
 
 warp-resphys experiment=finger
 python scripts/arm_film.py runs/finger/default
@@ -15,7 +16,14 @@ from warp_resphys.environments.arm_world import ArmWorld
 from warp_resphys.environments.making import make_vector
 from warp_resphys.environments.policies import ScriptedPlace
 from warp_resphys.environments.vector import CARRIER
-from warp_resphys.report.layers import MEASURED, Layer, RenderScene, View, body_layers, obstacle_layers
+from warp_resphys.report.layers import (
+    MEASURED,
+    Layer,
+    RenderScene,
+    View,
+    body_layers,
+    obstacle_layers,
+)
 from warp_resphys.report.render import write_film
 
 FILM = Path(__file__).parents[1] / "docs" / "films" / "pick_and_place.mp4"
@@ -26,8 +34,12 @@ MARGIN = 0.08  # around the arm, relative to its longer side
 GOAL = 0.25  # opacity
 
 
-def recorded(run: str) -> tuple[ArmWorld, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
-    """Returns the world, vertices (F, N, 3), those of the arm (F, P, 3), the goal (3,) [m], and frames a second."""
+def recorded(
+    run: str,
+) -> tuple[ArmWorld, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
+    """Returns the world, vertices (F, N, 3), those of the arm (F, P, 3),
+    the goal (3,) [m], and frames a second.
+    """
     robots = make_vector("pick_and_place", run, 1, seconds=SECONDS)
     world, policy, vertices, arms = robots.world, ScriptedPlace(robots), [], []
     assert isinstance(world, ArmWorld)
@@ -36,7 +48,13 @@ def recorded(run: str) -> tuple[ArmWorld, NDArray[np.float64], NDArray[np.float6
         vertices.append(world.bodies(robots.state)[1][0])
         arms.append(world.rigid(robots.state)[1][0])
         seen, *_ = robots.step(policy(seen))
-    return world, np.stack(vertices), np.stack(arms), robots.task.wanted(0, 0)[0], robots.metadata["render_fps"]
+    return (
+        world,
+        np.stack(vertices),
+        np.stack(arms),
+        robots.task.wanted(0, 0)[0],
+        robots.metadata["render_fps"],
+    )
 
 
 def scene_of(run: str) -> RenderScene:
@@ -44,7 +62,9 @@ def scene_of(run: str) -> RenderScene:
     world, vertices, arms, goal, rate = recorded(run)
     state = world.rest
     triangles, (carriers, _), around = world.bodies(state)[0], world.rigid(state), world.obstacles()
-    of_ball = (triangles >= world.ball.start).all(axis=1) & (triangles < world.ball.stop).all(axis=1)
+    of_ball = (triangles >= world.ball.start).all(axis=1) & (triangles < world.ball.stop).all(
+        axis=1
+    )
     axes = side_axes(np.array([0.0, 0.0, 1.0]), TURN, TILT)
     points = np.concatenate([*arms[::10], *vertices[::10]])
     focus, half = frame_of(points, axes, MARGIN)
@@ -55,10 +75,18 @@ def scene_of(run: str) -> RenderScene:
         *obstacle_layers(arms, carriers, colour=CARRIER),
         *body_layers(vertices, triangles[~of_ball], height, width=1.5),
         Layer("surface", vertices, shown, MEASURED, light=(0.62, 0.42)),
-        Layer("surface", vertices[0] + goal - vertices[0, world.ball].mean(axis=0), shown, MEASURED, opacity=GOAL),
+        Layer(
+            "surface",
+            vertices[0] + goal - vertices[0, world.ball].mean(axis=0),
+            shown,
+            MEASURED,
+            opacity=GOAL,
+        ),
     ]
     texts = [f"{number / rate:.1f} s" for number in range(len(vertices))]
-    return RenderScene([View(layers, axes, focus, height)], SIZE, background="white", texts=texts, fps=rate)
+    return RenderScene(
+        [View(layers, axes, focus, height)], SIZE, background="white", texts=texts, fps=rate
+    )
 
 
 if __name__ == "__main__":

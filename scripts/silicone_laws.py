@@ -1,9 +1,11 @@
-"""Writes the laws of silicones, warp_resphys/laws/*.json, and the tables of docs/results/silicones.md from tests.
+"""Writes the laws of silicones, warp_resphys/laws/*.json, and the tables of
+docs/results/silicones.md from tests.
 
     python scripts/silicone_laws.py FOLDER
 
-FOLDER has the tables of the Soft Robotics Materials Database (Marechal and others, Soft Robotics 8, 2021,
-doi 10.1089/soro.2019.0115; repository LucMarechal/Soft-Robotics-Materials-Database, Open Database License 1.0).
+FOLDER has the tables of the Soft Robotics Materials Database (Marechal and others, Soft Robotics 8,
+2021, doi 10.1089/soro.2019.0115; repository LucMarechal/Soft-Robotics-Materials-Database, Open
+Database License 1.0).
 """
 
 import json
@@ -20,7 +22,11 @@ from warp_resphys.data.material_tables import read_test
 from warp_resphys.energies.catalogue import read_law
 from warp_resphys.energies.isochoric import shear_modulus, stress
 from warp_resphys.io.resuming import package_versions
-from warp_resphys.learning.identification.material_tests import BEYOND, MeasuredLaw, identify_from_tests
+from warp_resphys.learning.identification.material_tests import (
+    BEYOND,
+    MeasuredLaw,
+    identify_from_tests,
+)
 from warp_resphys.learning.identification.specimens import MaterialTest
 from warp_resphys.settings.data_kinds import TableSettings
 
@@ -28,17 +34,19 @@ ROOT: Final = Path(__file__).parents[1]
 PAGE: Final = ROOT / "docs" / "results" / "silicones.md"
 TABLE: Final = TableSettings(columns=(None, None, None, "strain", "stress [MPa]"), header_lines=18)
 SOURCE: Final = (
-    "Uniaxial tension, ASTM D412 die C, 450 mm/min, strain from the crosshead; Soft Robotics Materials Database, doi "
-    "10.1089/soro.2019.0115, Open Database License 1.0"
+    "Uniaxial tension, ASTM D412 die C, 450 mm/min, strain from the crosshead; Soft Robotics "
+    "Materials Database, doi 10.1089/soro.2019.0115, Open Database License 1.0"
 )
 PSI: Final = 6.894757  # kPa
 LOW: Final = 0.05  # strain below which the tests are uncertain
 SHIPPED: Final = 2.0  # largest strain that the laws of the package are identified from
 RANGES: Final = (0.5, 1.0, 1.5, 2.0)  # largest strains by which the intervals are tested
-GROWTHS: Final = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)  # of intervals for each doubling of the strain
+# Of intervals for each doubling of the strain.
+GROWTHS: Final = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)
 LEVEL: Final = 0.9
 ASKED: Final = 1.0  # largest strain that the predictions are made from
-# File, nominal density [kg/m^3], and 100 % modulus by the data sheet [psi], if it was at hand, of the laws by name.
+# File, nominal density [kg/m^3], and 100 % modulus by the data sheet [psi], if it was at hand, of
+# the laws by name.
 LAWS: Final[dict[str, tuple[str, float, float | None]]] = {
     "ecoflex_00_10": ("Ecoflex 00-10", 1040.0, 8.0),
     "ecoflex_00_30": ("Ecoflex 00-30", 1070.0, 10.0),
@@ -72,14 +80,23 @@ class Tension:
     def within(self, low: float, high: float) -> MaterialTest:
         """Returns the samples between two strains, with an unknown zero of the load cell."""
         rows = (self.strain >= low) & (self.strain <= high)
-        return MaterialTest("tension", self.strain[rows], self.stress[rows], zero=0.05 * float(self.stress[rows].max()))
+        return MaterialTest(
+            "tension",
+            self.strain[rows],
+            self.stress[rows],
+            zero=0.05 * float(self.stress[rows].max()),
+        )
 
     def law(self, high: float, density: float = 1070.0, **options: Any) -> MeasuredLaw:
         """Returns the law that is identified up to a strain."""
         return identify_from_tests({"tension": self.within(LOW, high)}, density=density, **options)
 
-    def prediction(self, law: MeasuredLaw, high: float, growth: float = BEYOND) -> tuple[float, float]:
-        """Returns the relative error from a strain to twice that, and the share of the stresses in the interval."""
+    def prediction(
+        self, law: MeasuredLaw, high: float, growth: float = BEYOND
+    ) -> tuple[float, float]:
+        """Returns the relative error from a strain to twice that,
+        and the share of the stresses in the interval.
+        """
         beyond = self.within(math.nextafter(high, math.inf), 2.0 * high)
         value, half = law.interval("tension", beyond.strain, growth)
         held = np.abs(value + law.machines["tension"]["zero"] - beyond.stress) <= half
@@ -100,15 +117,25 @@ def main(arguments: Sequence[str]) -> None:
         text = json.dumps(content, indent=1, ensure_ascii=False)
         (ROOT / "warp_resphys" / "laws" / f"{name}.json").write_text(text + "\n", encoding="utf-8")
     text = PAGE.read_text(encoding="utf-8")
-    for name, rows in {"laws": _laws(laws), "predicted": _predictions(tests), "twice": _dragon_skins()}.items():
+    for name, rows in {
+        "laws": _laws(laws),
+        "predicted": _predictions(tests),
+        "twice": _dragon_skins(),
+    }.items():
         start, end = f"<!-- {name} -->\n", f"<!-- /{name} -->"
-        text = text[: text.index(start) + len(start)] + "\n".join(rows) + "\n" + text[text.index(end) :]
+        text = (
+            text[: text.index(start) + len(start)]
+            + "\n".join(rows)
+            + "\n"
+            + text[text.index(end) :]
+        )
     PAGE.write_text(text, encoding="utf-8")
 
 
 def _laws(laws: dict[str, MeasuredLaw]) -> list[str]:
     rows = [
-        "| name | $c_{10}$ | $c_{01}$ | $\\mu_3$ | shear modulus at rest | error | stress at 100 % | by data sheet |",
+        "| name | $c_{10}$ | $c_{01}$ | $\\mu_3$ | shear modulus at rest | error | stress at 100 "
+        "% | by data sheet |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name, law in laws.items():
@@ -129,40 +156,62 @@ def _laws(laws: dict[str, MeasuredLaw]) -> list[str]:
 
 def _predictions(tests: dict[str, Tension]) -> list[str]:
     rows = [
-        "| silicone | neo-Hookean, 5 to 100 % | law | neo-Hookean, 100 to 200 % | law | in the 90 % interval |",
+        "| silicone | neo-Hookean, 5 to 100 % | law "
+        "| neo-Hookean, 100 to 200 % | law | in the 90 % interval |",
         "|---|---|---|---|---|---|",
     ]
     for name, test in _reaching(tests, ASKED).items():
         law, simple = test.law(ASKED), test.law(ASKED, terms=())
         beyond, held = test.prediction(law, ASKED)
-        errors = (simple.errors["tension"], law.errors["tension"], test.prediction(simple, ASKED)[0], beyond)
-        rows.append(f"| {name} | {' | '.join(f'{100.0 * error:.1f} %' for error in errors)} | {100.0 * held:.0f} % |")
-    shares, by_growth = [], dict[str, list[list[float]]]()  # by silicone: of each range, for each of GROWTHS
+        errors = (
+            simple.errors["tension"],
+            law.errors["tension"],
+            test.prediction(simple, ASKED)[0],
+            beyond,
+        )
+        rows.append(
+            f"| {name} | {' | '.join(f'{100.0 * error:.1f} %' for error in errors)} | "
+            f"{100.0 * held:.0f} % |"
+        )
+    # By silicone: of each range, for each of GROWTHS.
+    shares, by_growth = [], dict[str, list[list[float]]]()
     for high in RANGES:
         covered = list[float]()
         for name, test in _reaching(tests, high).items():
             law = test.law(high)
             covered.append(test.prediction(law, high)[1])
-            by_growth.setdefault(name, []).append([test.prediction(law, high, growth)[1] for growth in GROWTHS])
+            by_growth.setdefault(name, []).append(
+                [test.prediction(law, high, growth)[1] for growth in GROWTHS]
+            )
         shares.append(f"{100.0 * np.mean(covered):.0f} %")
     ends = ", ".join(f"{100.0 * high:.0f} %" for high in RANGES)
-    said = f"Of laws that are identified up to {ends}, the 90 % intervals hold {', '.join(shares)} of the stresses"
-    return [*rows, "", f"{said} up to twice these strains, means over all silicones. {_left_out(by_growth)}"]
+    said = (
+        f"Of laws that are identified up to {ends}, "
+        f"the 90 % intervals hold {', '.join(shares)} of the stresses"
+    )
+    return [
+        *rows,
+        "",
+        f"{said} up to twice these strains, means over all silicones. {_left_out(by_growth)}",
+    ]
 
 
 def _left_out(by_growth: dict[str, list[list[float]]]) -> str:
-    """Returns a sentence on intervals whose growth is chosen without the silicone that they are for."""
+    """A sentence on intervals whose growth is chosen without the silicone that they are for."""
     chosen, held = list[float](), list[float]()
     for name, mine in by_growth.items():
-        others = np.mean([row for other, rows in by_growth.items() if other != name for row in rows], axis=0)
+        others = np.mean(
+            [row for other, rows in by_growth.items() if other != name for row in rows], axis=0
+        )
         growth = int(np.argmax(others >= LEVEL))
         chosen.append(100.0 * GROWTHS[growth])
         held += [row[growth] for row in mine]
     least, most = min(chosen), max(chosen)
     of = f"{least:.0f} %" if least == most else f"{least:.0f} to {most:.0f} %"
     return (
-        f"Chosen on all silicones but the one that is predicted, the least width that holds 90 % of the stresses is "
-        f"{of} for each doubling of the strain, and holds {100.0 * np.mean(held):.0f} % of those left out."
+        "Chosen on all silicones but the one that is predicted, the least width that holds 90 % "
+        f"of the stresses is {of} for each doubling of the strain, and holds "
+        f"{100.0 * np.mean(held):.0f} % of those left out."
     )
 
 

@@ -38,34 +38,58 @@ torch.set_num_threads(1)
 gc.freeze()  # A collection passes over what is imported, and comes less often.
 gc.set_threshold(10_000, 10, 10)
 
-# Modules of tests that are repeated as on other processors. Their results come from code of libraries that differs
-# between processors, and from decisions on its last digits: decompositions, iterations that end at a threshold,
-# searches that turn back or compare costs, trainings, and orders of nearly equal values. Warp compiles kernels for the
-# processor that there is: energies, elements, contact and errors are kernels or closed formulas, and refused input has
-# no digits. Functions that only call what is tested here (`test_library`, `test_sessions`) add none.
+# Modules of tests that are repeated as on other processors. Their results come from code of
+# libraries that differs between processors, and from decisions on its last digits: decompositions,
+# iterations that end at a threshold, searches that turn back or compare costs, trainings, and
+# orders of nearly equal values. Warp compiles kernels for the processor that there is: energies,
+# elements, contact and errors are kernels or closed formulas, and refused input has no digits.
+# Functions that only call what is tested here (`test_library`, `test_sessions`) add none.
 NUMERICAL = {
-    *("test_least_squares", "test_linear_solver", "test_pardiso"),  # decompositions and iterations of systems
-    *("test_corotation", "test_gradients", "test_integrator", "test_linearisation", "test_modes"),  # factors in steps
+    # decompositions and iterations of systems
+    *("test_least_squares", "test_linear_solver", "test_pardiso"),
+    # factors in steps
+    *("test_corotation", "test_gradients", "test_integrator", "test_linearisation", "test_modes"),
     *("test_nonlinear_solver", "test_safeguards"),  # line searches, failures
-    *("test_force_sensors", "test_reconstruction", "test_replay"),  # least squares of forces and of starts
-    *("test_identification", "test_placement", "test_sensitivity"),  # searches of parameters, and their covariances
-    *("test_law", "test_material_tests", "test_stray_samples"),  # selection of terms, classes and samples
-    *("test_acceptance", "test_actuator", "test_baselines", "test_correction", "test_in_the_loop"),  # trainings
+    # least squares of forces and of starts
+    *("test_force_sensors", "test_reconstruction", "test_replay"),
+    # searches of parameters, and their covariances
+    *("test_identification", "test_placement", "test_sensitivity"),
+    # selection of terms, classes and samples
+    *("test_law", "test_material_tests", "test_stray_samples"),
+    # trainings
+    *("test_acceptance", "test_actuator", "test_baselines", "test_correction", "test_in_the_loop"),
     *("test_networks", "test_without_physics"),
-    *("test_clouds", "test_outlines", "test_picture_misfit", "test_released_motion", "test_tags"),  # closest points
+    # closest points
+    *("test_clouds", "test_outlines", "test_picture_misfit", "test_released_motion", "test_tags"),
 }
 # modules of tests
 LOOK_AT_PICTURES = {
-    *("test_bodies", "test_figures", "test_render", "test_report", "test_environments", "test_film"),
+    "test_bodies",
+    "test_figures",
+    "test_render",
+    "test_report",
+    "test_environments",
+    "test_film",
     *("test_control_run", "test_inspect_mesh", "test_motion_film"),
 }
-DECODE_IN_PROCESSES = {"test_damaged_files", "test_foreign_recordings", "test_mesh", "test_recordings"}  # as users do
+# As users do.
+DECODE_IN_PROCESSES = {
+    "test_damaged_files",
+    "test_foreign_recordings",
+    "test_mesh",
+    "test_recordings",
+}
 COMMAND = render.COMMAND  # which tests without drawing replace
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--device", default="cpu", choices=["cpu", "cuda"], help="device of the tests marked validation")
+    parser.addoption(
+        "--device",
+        default="cpu",
+        choices=["cpu", "cuda"],
+        help="device of the tests marked validation",
+    )
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -82,7 +106,9 @@ def device(request: pytest.FixtureRequest) -> str:
 
 
 def folder_beside_the_repository(name: str, content: str) -> Path:
-    folder = Path(os.environ.get(f"WARP_RESPHYS_{name.upper()}", Path(__file__).parents[2] / "shared" / name))
+    folder = Path(
+        os.environ.get(f"WARP_RESPHYS_{name.upper()}", Path(__file__).parents[2] / "shared" / name)
+    )
     if not folder.is_dir():
         pytest.skip(f"set WARP_RESPHYS_{name.upper()} to a folder with {content}")
     return folder
@@ -119,9 +145,11 @@ def can_draw(renderer: render.Renderer) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _configurations_are_read_once():
-    """The files of the package's own configuration and the schemas of settings, which every command reads anew.
+    """The files of the package's own configuration and the schemas of settings,
+    which every command reads anew.
 
-    Hydra does not compose a configuration twice, the first time to read `hydra.mode`, which nothing here sets.
+    Hydra does not compose a configuration twice, the first time to read `hydra.mode`, which nothing
+    here sets.
     """
     Plugins.instance()  # imports the classes of the sources anew
     source, kept = SourcesRegistry.instance().resolve("pkg"), {}
@@ -135,14 +163,22 @@ def _configurations_are_read_once():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(source, "load_config", read)
         patch.setattr(Hydra, "get_mode", lambda *_, **__: None)
-        patch.setattr(Settings, "model_json_schema", classmethod(functools.cache(Settings.model_json_schema.__func__)))
+        patch.setattr(
+            Settings,
+            "model_json_schema",
+            classmethod(functools.cache(Settings.model_json_schema.__func__)),
+        )
         yield
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _options_are_composed_once():
-    """What Hydra makes of the same options of the same files, before it sets single keys; a copy for each test."""
-    list_defaults, compose = defaults_list._create_defaults_list, ConfigLoaderImpl._compose_config_from_defaults_list
+    """What Hydra makes of the same options of the same files, before it sets single keys.
+
+    A copy for each test.
+    """
+    list_defaults = defaults_list._create_defaults_list
+    compose = ConfigLoaderImpl._compose_config_from_defaults_list
     listed: dict[str, Any] = {}
     configs: dict[str, Any] = {}
 
@@ -152,7 +188,10 @@ def _options_are_composed_once():
         for source in repo.get_sources():
             found.append(f"{source.scheme()}://{source.path}")
             if source.scheme() == "file":
-                found += [(str(path), path.read_bytes()) for path in sorted(Path(source.path).rglob("*.yaml"))]
+                found += [
+                    (str(path), path.read_bytes())
+                    for path in sorted(Path(source.path).rglob("*.yaml"))
+                ]
         return found
 
     def list_once(repo: Any, name: str | None, overrides: Any, **options: bool) -> Any:
@@ -212,7 +251,9 @@ def renderers_used_again(kept_renderers: list[Any]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
-    """Small pictures by processes that are used again, and figures without a layout that are drawn once."""
+    """Small pictures by processes that are used again,
+    and figures without a layout that are drawn once.
+    """
     frames = render.Renderer.frames
 
     def coarse(self: render.Renderer, scene: render.RenderScene) -> Iterator[render.Pixels]:
@@ -221,7 +262,9 @@ def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
     with renderers_used_again(kept_renderers), pytest.MonkeyPatch.context() as patch:
         patch.setattr(render.Renderer, "frames", coarse)
         patch.setattr(figures, "settle", lambda figure: figure.set_layout_engine("none"))
-        patch.setattr(figures, "save_png", lambda figure, path: figure.savefig(path, format="png", dpi=20))
+        patch.setattr(
+            figures, "save_png", lambda figure, path: figure.savefig(path, format="png", dpi=20)
+        )
         patch.setattr(figures, "themed_svg", lambda figure, name: b"<svg/>")
         yield
 
@@ -235,13 +278,19 @@ def used_again(kept_renderers):
 @pytest.fixture(scope="module", autouse=True)
 def _pictures(request, kept_renderers):
     """Coarse pictures, but for tests that look at them."""
-    with contextlib.nullcontext() if request.path.stem in LOOK_AT_PICTURES else coarse_pictures(kept_renderers):
+    with (
+        contextlib.nullcontext()
+        if request.path.stem in LOOK_AT_PICTURES
+        else coarse_pictures(kept_renderers)
+    ):
         yield
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _files_are_decoded_here(request):
-    """Files of other programs, but where damaged ones are read: a process for each takes half a second."""
+    """Files of other programs, but where damaged ones are read:
+    a process for each takes half a second.
+    """
 
     def here(library: str, path: Path, *names: str) -> decoding.Arrays:
         return decoding.decoded(library, str(path), *names)
@@ -281,7 +330,9 @@ def no_report():
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory, kept_renderers):
-    """A complete run with its report, and its files before and after a second run of the same command."""
+    """A complete run with its report, and its files before
+    and after a second run of the same command.
+    """
     root = tmp_path_factory.mktemp("finished")
     with contextlib.chdir(root), coarse_pictures(kept_renderers):
         assert run(*TINY, IN_RUN)[0] == 0

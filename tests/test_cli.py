@@ -74,7 +74,9 @@ class AnyKeys(Settings):
 class Command:
     """Runs `warp-resphys` in this process, with a job of the test's choice."""
 
-    def __init__(self, config_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def __init__(
+        self, config_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
         self.job: Callable[[dict[str, Any]], object] = lambda config: None
         self.outputs: list[str] = []
         self.arguments = ["warp-resphys", "--config-path", str(config_dir)]
@@ -105,12 +107,19 @@ class TestRunFolder:
         assert command.outputs == ["runs/beam/default"]
         command("seed=3", "material.density=900", "experiment=beam_twist")
         assert command.outputs == ["runs/beam_twist/material.density=900,seed=3"]
-        assert command("--multirun", "experiment=beam,beam_twist", "material.density=900", "seed=3")[0] == 0
-        assert command.outputs == [f"runs/{name}/material.density=900,seed=3" for name in ("beam", "beam_twist")]
+        assert (
+            command("--multirun", "experiment=beam,beam_twist", "material.density=900", "seed=3")[0]
+            == 0
+        )
+        assert command.outputs == [
+            f"runs/{name}/material.density=900,seed=3" for name in ("beam", "beam_twist")
+        ]
 
     def test_a_sweep_over_names(self, command, tmp_path):
         (tmp_path / "a,b").mkdir()
-        assert command("name=20261128,1e5,'c, d',Ü (1)", "--multirun", "hydra.sweep.dir=Ü/${name}", "seed=1") == (0, "")
+        assert command(
+            "name=20261128,1e5,'c, d',Ü (1)", "--multirun", "hydra.sweep.dir=Ü/${name}", "seed=1"
+        ) == (0, "")
         assert [folder.rpartition("/")[0] for folder in command.outputs] == [
             f"Ü/{name}" for name in ("20261128", "1e5", "c, d", "Ü (1)")
         ]
@@ -125,14 +134,18 @@ class TestRunFolder:
 
     def test_labels(self):
         assert run_label([]) == "default"
-        assert run_label(["device=cuda", "+extra.device=cpu"], ["device", "extra.device"]) == "default"
+        assert (
+            run_label(["device=cuda", "+extra.device=cpu"], ["device", "extra.device"]) == "default"
+        )
         assert run_label(["b=2", "a.c=1e-3", "~d"]) == "a.c=1e-3,b=2,~d"
         assert run_label(["a=2", "a=1"]) == "a=1"
         tuning = ["tune.trials=3", "~tune.space.trainer.gamma", "seed=1"]
         assert run_label(tuning, ["tune"]) == "seed=1"
         awkward = [run_label([f"a={value}"]) for value in ("x/y", "x y", "x" * 300, "x" * 301)]
         assert len(set(awkward)) == 4
-        assert all(set(label) <= set("axy=-0123456789abcdef") and len(label) < 120 for label in awkward)
+        assert all(
+            set(label) <= set("axy=-0123456789abcdef") and len(label) < 120 for label in awkward
+        )
 
 
 class TestOwnOptions:
@@ -147,14 +160,21 @@ class TestOwnOptions:
             path.write_text(text)
         return tmp_path / "configs"
 
-    def test_they_lie_in_the_working_directory_or_another_folder_and_help_names_them(self, command, own):
+    def test_they_lie_in_the_working_directory_or_another_folder_and_help_names_them(
+        self, command, own
+    ):
         assert command("experiment=my_robot", "seed=1") == (0, "")
         assert command.outputs == ["runs/my_robot/seed=1"]
         code, errors = command("experiment=my_robt")
-        assert (code, errors.partition(";")[0]) == (2, "error: unknown experiment 'my_robt', did you mean 'my_robot'?")
+        assert (code, errors.partition(";")[0]) == (
+            2,
+            "error: unknown experiment 'my_robt', did you mean 'my_robot'?",
+        )
         assert command("experiment=zzz")[1].endswith("known are beam, beam_twist, my_robot\n")
         _, out, err = outcome("--help")
-        assert re.search("^experiment: beam_.*, my_robot, .*, tentacle_wrap$", out, flags=re.MULTILINE)
+        assert re.search(
+            "^experiment: beam_.*, my_robot, .*, tentacle_wrap$", out, flags=re.MULTILINE
+        )
         assert err == ""
         assert command("--config-dir", "elsewhere", "experiment=other_robot") == (0, "")
         assert command("--config-dir", "elsewhere", "experiment=my_robot")[0] == 2
@@ -163,19 +183,32 @@ class TestOwnOptions:
         (own / "config.yaml").write_text("name: of something else")
         (own / "trainer").mkdir()
         (own / "trainer" / "default.yaml").write_text("epochs: 1")
-        warning = "warning: configs/trainer/default.yaml is ignored: the package has an option of that name\n"
+        warning = (
+            "warning: configs/trainer/default.yaml is ignored: the package has an option of that "
+            "name\n"
+        )
         assert command("experiment=my_robot") == (0, warning)
         assert command.outputs == ["runs/my_robot/default"]
 
     @pytest.mark.parametrize("encoding", ["cp1252", "utf-8-sig", "utf-16"])
     def test_another_encoding_is_read(self, command, own, encoding, recwarn):
-        (own / "experiment" / "my_robot.yaml").write_text("# @package _global_\nname: Träger\n", encoding=encoding)
-        assert (command("experiment=my_robot"), command.outputs) == ((0, ""), ["runs/Träger/default"])
-        assert any("Windows-1252" in str(warning.message) for warning in recwarn) == (encoding == "cp1252")
+        (own / "experiment" / "my_robot.yaml").write_text(
+            "# @package _global_\nname: Träger\n", encoding=encoding
+        )
+        assert (command("experiment=my_robot"), command.outputs) == (
+            (0, ""),
+            ["runs/Träger/default"],
+        )
+        assert any("Windows-1252" in str(warning.message) for warning in recwarn) == (
+            encoding == "cp1252"
+        )
 
     @pytest.mark.parametrize(
         ("text", "problem"),
-        [("name: a\nname: b\n", "found duplicate key name"), ("name: [a\nseed: 1\n", "expected ',' or ']'")],
+        [
+            ("name: a\nname: b\n", "found duplicate key name"),
+            ("name: [a\nseed: 1\n", "expected ',' or ']'"),
+        ],
     )
     def test_invalid_yaml_is_named_with_its_line(self, command, own, text, problem):
         (path := own / "experiment" / "my_robot.yaml").write_text("# @package _global_\n" + text)
@@ -212,7 +245,10 @@ class TestUserErrors:
     def test_of_the_job(self, command):
         for job, sentence in (
             (lambda config: refuse(), "no such body"),
-            (lambda config: hydra.utils.instantiate({"_target_": f"{__name__}.refuse"}), "no such body"),
+            (
+                lambda config: hydra.utils.instantiate({"_target_": f"{__name__}.refuse"}),
+                "no such body",
+            ),
             (lambda config: disk_is_full(), "disk is full while writing picture.png"),
         ):
             command.job = job
@@ -246,7 +282,9 @@ def disk_is_full() -> None:
 
 
 class TestOtherEnds:
-    def test_faults_of_the_program_keep_their_traceback_and_nothing_global_is_left_changed(self, command, monkeypatch):
+    def test_faults_of_the_program_keep_their_traceback_and_nothing_global_is_left_changed(
+        self, command, monkeypatch
+    ):
         command("seed=[1")
         assert "HYDRA_FULL_ERROR" not in os.environ
         assert logging.raiseExceptions is True
@@ -288,10 +326,14 @@ class TestCommands:
 
         for name, entry in commands.COMMANDS.items():
             module, function = f"warp_resphys.{entry.function}".split(":")
-            monkeypatch.setitem(sys.modules, module, sys.modules.get(module, types.ModuleType(module)))
+            monkeypatch.setitem(
+                sys.modules, module, sys.modules.get(module, types.ModuleType(module))
+            )
             monkeypatch.setattr(sys.modules[module], function, recorder(name), raising=False)
         for name in ("check", "inspect", "view_film"):
-            (config_dir / f"{name}.yaml").write_text("defaults: [config, _self_]\nfiles: []\nrun: null")
+            (config_dir / f"{name}.yaml").write_text(
+                "defaults: [config, _self_]\nfiles: []\nrun: null"
+            )
         return called
 
     @pytest.mark.parametrize(
@@ -316,12 +358,19 @@ class TestCommands:
         assert calls[0][1]["files"] == ["a.npz", "b c's [1],.npz"]
         assert command("view", "film", "runs/beam/seed=1") == (0, "")
         assert calls[1][1]["run"] == "runs/beam/seed=1"
-        assert command("view", "film", "a", "b")[1].startswith("error: cannot read the override 'b'")
+        assert command("view", "film", "a", "b")[1].startswith(
+            "error: cannot read the override 'b'"
+        )
         assert len(calls) == 2
 
     def test_options_with_a_value_are_those_of_hydra(self):
         actions = get_args_parser()._actions
-        valued = {name for action in actions if action.nargs in (None, "?") for name in action.option_strings}
+        valued = {
+            name
+            for action in actions
+            if action.nargs in (None, "?")
+            for name in action.option_strings
+        }
         assert set(commands.VALUED) == valued
 
 
@@ -331,21 +380,37 @@ _OWN = {"my_robot", "my_arm", "ecoflex", "--cfg"}  # experiments that the reader
 def documented():
     """Every command line with arguments in the documentation and in the help, without comments."""
     commands_found = set()
-    patterns = ("*.md", "docs/*.md", "docs/bring_your_robot/*.md", "docs/tutorials/*.md", "conf/**/*.yaml")
+    patterns = (
+        "*.md",
+        "docs/*.md",
+        "docs/bring_your_robot/*.md",
+        "docs/tutorials/*.md",
+        "conf/**/*.yaml",
+    )
     for path in [path for pattern in patterns for path in REPOSITORY.glob(pattern)]:
         text = re.sub(r"\\\n *", "", path.read_text(encoding="utf-8"))
-        lines = re.findall(r"^[# ]*warp-resphys (.*)$|`warp-resphys ([^`]*)`", text, flags=re.MULTILINE)
+        lines = re.findall(
+            r"^[# ]*warp-resphys (.*)$|`warp-resphys ([^`]*)`", text, flags=re.MULTILINE
+        )
         commands_found |= {re.split(r"  +[\w(]|#", a or b)[0].strip() for a, b in lines}
-    return sorted(line for line in commands_found if "=" in line and not _OWN & {*re.split(r"[ =]", line)})
+    return sorted(
+        line for line in commands_found if "=" in line and not _OWN & {*re.split(r"[ =]", line)}
+    )
 
 
 @pytest.mark.slow
 def test_every_documented_line_has_keys_that_exist():
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
         for line in documented():
-            command, arguments = commands.parse([word for word in shlex.split(line) if word != "--multirun"])
+            command, arguments = commands.parse(
+                [word for word in shlex.split(line) if word != "--multirun"]
+            )
             elsewhere = ("hydra/launcher=",)  # packages that are not installed
-            known = [re.sub(r"^seed=0,.*", "seed=0", word) for word in arguments if not word.startswith(elsewhere)]
+            known = [
+                re.sub(r"^seed=0,.*", "seed=0", word)
+                for word in arguments
+                if not word.startswith(elsewhere)
+            ]
             compose(commands.configuration(command), readable(known)[0])
             if command in ("run", "tune"):
                 names = [word.partition("=")[0].lstrip("+~") for word in known]
@@ -355,18 +420,27 @@ def test_every_documented_line_has_keys_that_exist():
 @functools.cache
 def _patterns():
     """Regular expressions of the dotted names of all keys of a run."""
-    return [key.replace(".", r"\.").replace("NAME", "[^.]+") for key in keys(RunSettings.model_json_schema())]
+    return [
+        key.replace(".", r"\.").replace("NAME", "[^.]+")
+        for key in keys(RunSettings.model_json_schema())
+    ]
 
 
 def _is_key(name):
     """Whether a run has a key of a dotted name."""
-    free = ("hydra.", "tune.", "simulation.", "target.", "laboratory.material.")  # not in the schema
+    # Not in the schema.
+    free = ("hydra.", "tune.", "simulation.", "target.", "laboratory.material.")
     return name.startswith(free) or any(re.fullmatch(pattern, name) for pattern in _patterns())
 
 
 def test_all_keys_are_shown_with_their_defaults_and_nothing_is_written(folder):
     shown = OmegaConf.create(outcome("--cfg", "job", "seed=3", "mesh=rod").out)
-    assert (shown.seed, shown.mesh.kind, shown.mesh.grading, shown.parallel.processes) == (3, "rod", 0.0, 1)
+    assert (shown.seed, shown.mesh.kind, shown.mesh.grading, shown.parallel.processes) == (
+        3,
+        "rod",
+        0.0,
+        1,
+    )
     assert list(folder.iterdir()) == []
 
 
@@ -385,14 +459,18 @@ class TestProcess:
                 "import signal, sys, time, types",
                 f"experiment = sys.modules[{EXPERIMENT!r}] = types.ModuleType('experiment')",
                 "from warp_resphys.io.settings import Settings",
-                "def run(config: type('AnyKeys', (Settings,), {'model_config': {'extra': 'ignore'}}), folder):",
+                "def run(config: type('AnyKeys', (Settings,), {'model_config': {'extra': "
+                "'ignore'}}), folder):",
                 *(f"    {line}" for line in lines),
                 "experiment.run_experiment = run",
             ]
         )
 
     def test_the_version_is_that_of_the_package(self, config_dir):
-        assert self.start(config_dir, "", "--version").communicate(timeout=60)[0] == f"warp-resphys {__version__}\n"
+        assert (
+            self.start(config_dir, "", "--version").communicate(timeout=60)[0]
+            == f"warp-resphys {__version__}\n"
+        )
 
     def test_help_imports_nothing_heavy(self, config_dir):
         heavy = """
@@ -400,7 +478,8 @@ class TestProcess:
             for name in ("torch", "warp", "numpy", "h5py", "hydra"):
                 sys.modules[name] = None  # importing it fails
             def show():
-                print("imported:", *sorted(name for name in sys.modules if name.startswith("warp_resphys")))
+                ours = [name for name in sys.modules if name.startswith("warp_resphys")]
+                print("imported:", *sorted(ours))
             atexit.register(show)
         """
         out, err = self.start(config_dir, heavy, "--help").communicate(timeout=60)
@@ -430,7 +509,9 @@ class TestProcess:
         assert child.stderr.read().count("\n") == lines
 
     def test_another_pipe_that_breaks_is_a_fault_of_the_program(self, config_dir):
-        _, err = self.start(config_dir, self.job('raise BrokenPipeError(32, "Broken pipe")')).communicate(timeout=60)
+        _, err = self.start(
+            config_dir, self.job('raise BrokenPipeError(32, "Broken pipe")')
+        ).communicate(timeout=60)
         assert err.endswith("BrokenPipeError: [Errno 32] Broken pipe\n")
 
 

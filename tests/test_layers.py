@@ -1,4 +1,7 @@
-"""The table in CONTRIBUTING.md says where every module is; imports point up it, and never in a circle."""
+"""The table in CONTRIBUTING.md says where every module is.
+
+Imports point up it, and never in a circle.
+"""
 
 import ast
 import functools
@@ -21,7 +24,11 @@ def rows():
     text = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8")
     text = text[text.index("## Where things are") : text.index("## Six nouns")]
     cells = re.findall(r"^\| ((?:`[\w/]+`(?:, )?)+) \|", text, flags=re.MULTILINE)
-    places = [(place, row) for row, cell in enumerate(cells) for place in re.findall(r"`([a-z_/]+)`", cell)]
+    places = [
+        (place, row)
+        for row, cell in enumerate(cells)
+        for place in re.findall(r"`([a-z_/]+)`", cell)
+    ]
     assert len({place for place, _ in places}) == len(places)
     return dict(places)
 
@@ -29,14 +36,19 @@ def rows():
 def place_of(name):
     """Where a module inside the package belongs: "io.text" to `io/`, "cli" to `cli`."""
     first = name.split(".")[0]
-    return f"{first}/" if (PACKAGE / first).is_dir() or first in ("kernels", "conf", "scripts") else first
+    is_folder = (PACKAGE / first).is_dir() or first in ("kernels", "conf", "scripts")
+    return f"{first}/" if is_folder else first
 
 
 @functools.cache
 def modules():
-    """File and dotted name below the package of every module but the package's own file, which only hands out names."""
+    """Files and dotted names below the package of all modules but its own, of names."""
     found = {}
-    for folder, prefix in ((PACKAGE, ()), (KERNELS, ("kernels",)), (REPOSITORY / "scripts", ("scripts",))):
+    for folder, prefix in (
+        (PACKAGE, ()),
+        (KERNELS, ("kernels",)),
+        (REPOSITORY / "scripts", ("scripts",)),
+    ):
         for path in folder.rglob("*.py"):
             parts = path.relative_to(folder).with_suffix("").parts
             parts = parts[:-1] if parts[-1] == "__init__" else parts
@@ -53,7 +65,7 @@ def parsed(path):
 
 @functools.cache
 def imported(path):
-    """Names below the package that a file imports from, and whether it does so when it is itself imported."""
+    """Names below the package that a file imports from, and whether on its own import."""
     tree = parsed(path)
     package = ("warp_resphys", *modules()[path].split("."))
     package = package if path.name == "__init__.py" else package[:-1]
@@ -61,7 +73,10 @@ def imported(path):
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else ()
-            names = [".".join([*base, *([node.module] if node.module else []), alias.name]) for alias in node.names]
+            names = [
+                ".".join([*base, *([node.module] if node.module else []), alias.name])
+                for alias in node.names
+            ]
         elif isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         else:
@@ -69,13 +84,20 @@ def imported(path):
         for name in names:
             if name.startswith("warp_resphys."):
                 name = name.removeprefix("warp_resphys.")
-                found.append((name if name in known else name.rpartition(".")[0], node in tree.body))
+                found.append(
+                    (name if name in known else name.rpartition(".")[0], node in tree.body)
+                )
     return found
 
 
 def test_every_module_has_its_place_and_every_place_a_module():
     places = {place_of(name) for name in modules().values()}
     assert {*places, "conf/"} == {place for place in rows() if place != "tests/"}
+
+
+def test_no_two_modules_have_one_name():
+    names = Counter(path.name for path in modules())
+    assert {name for name, count in names.items() if count > 1} <= {"__init__.py", "base.py"}
 
 
 def test_imports_point_up():
@@ -89,12 +111,19 @@ def test_imports_point_up():
 
 
 def test_no_two_modules_import_each_other():
-    graph = {name: {other for other, _ in imported(path) if other != name} for path, name in modules().items()}
+    graph = {
+        name: {other for other, _ in imported(path) if other != name}
+        for path, name in modules().items()
+    }
     TopologicalSorter(graph).prepare()  # Raises a CycleError that names the circle.
 
 
 def named_in_the_table_of_the_paper():
-    text = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("## Where the paper is")[2]
+    text = (
+        (REPOSITORY / "CONTRIBUTING.md")
+        .read_text(encoding="utf-8")
+        .partition("## Where the paper is")[2]
+    )
     return re.findall(r"`((?:[a-z_]+\.)+\w+(?:\.\w+)?)`", text.partition("\n## ")[0])
 
 
@@ -109,6 +138,8 @@ def test_what_the_table_of_the_paper_names_is_there(name):
 
 def test_one_name_is_one_class():
     trees = [parsed(path) for path in (*PACKAGE.rglob("*.py"), *KERNELS.rglob("*.py"))]
-    names = Counter(node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef))
+    names = Counter(
+        node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)
+    )
     twice = {name for name, count in names.items() if count > 1 and not name.startswith("_")}
     assert twice == set()

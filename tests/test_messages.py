@@ -33,22 +33,30 @@ def buckling(share, x):
 
 
 MESSAGES = {
-    "Unknown input presure. This body accepts external_force, internal_force, fixed_positions, attached_mass.": (
+    "Unknown input presure. This body accepts external_force, internal_force, fixed_positions, "
+    "attached_mass.": (
         lambda: beam().step(beam().rest_state(), wr.Inputs(presure=torch.zeros(1, 2)))
     ),
-    "5 of 20 vertices (11, 12, 13, 14, 15; counted from 0) lie on another one, a crack between cells; merge or glue "
-    "them (gmsh: Coherence, Abaqus: one part)": collapsed,
-    "1 of 1 bodies have no equilibrium under these loads: they grow to more than 100 times their size; lower the "
-    "loads, or take a stiffer material.": lambda: beam().static_equilibrium(pushed(1e3)),
-    "no equilibrium was found: under growing loads it is lost beyond 30 % of them; lower the loads, or take a stiffer "
-    "material.": lambda: find_equilibrium(buckling, torch.zeros(1, 2, 3), torch.zeros(1, 2, 3), limited=False),
-    "the quasi_newton solver stopped after 1 iterations with a relative residual of SIZE in environment 0 of 1: take a "
-    "smaller time step or loads, raise solver.max_iterations, or choose solver.name=newton.": (
+    "5 of 20 vertices (11, 12, 13, 14, 15; counted from 0) lie on another one, a crack between "
+    "cells; merge or glue them (gmsh: Coherence, Abaqus: one part)": collapsed,
+    "1 of 1 bodies have no equilibrium under these loads: they grow to more than 100 times their "
+    "size; lower the loads, or take a stiffer material.": lambda: beam().static_equilibrium(
+        pushed(1e3)
+    ),
+    "no equilibrium was found: under growing loads it is lost beyond 30 % of them; lower the "
+    "loads, or take a stiffer material.": lambda: find_equilibrium(
+        buckling, torch.zeros(1, 2, 3), torch.zeros(1, 2, 3), limited=False
+    ),
+    "the quasi_newton solver stopped after 1 iterations with a relative residual of SIZE in "
+    "environment 0 of 1: take a smaller time step or loads, raise solver.max_iterations, or "
+    "choose solver.name=newton.": (
         lambda: beam(max_iterations=1).step(beam().rest_state(), pushed(0.1))
     ),
     "youngs_modulus is -100000: it must be positive, in Pa.": lambda: wr.Corotated(-1e5),
-    "a body without fixed vertices has no static equilibrium: fix some vertices, or lay it on an obstacle with "
-    "friction, within the distance of contact.": (lambda: beam(FREE).static_equilibrium()),
+    "a body without fixed vertices has no static equilibrium: fix some vertices, or lay it on an "
+    "obstacle with friction, within the distance of contact.": (
+        lambda: beam(FREE).static_equilibrium()
+    ),
 }
 
 

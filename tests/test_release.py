@@ -1,4 +1,6 @@
-"""The files of a release agree with one another: versions, bounds, workflows, recipes, containers and fragments."""
+"""The files of a release agree with one another: versions, bounds,
+workflows, recipes, containers and fragments.
+"""
 
 import json
 import re
@@ -30,13 +32,21 @@ PROJECT = tomllib.loads(text("pyproject.toml"))
 def bounds(*extras):
     """Lower bounds of the dependencies, or of extras."""
     project = PROJECT["project"]
-    lists = [project["optional-dependencies"][extra] for extra in extras] or [project["dependencies"]]
-    return dict(match.groups() for entry in chain(*lists) if (match := re.match(r"([\w-]+)>=([\w.]+)", entry)))
+    lists = [project["optional-dependencies"][extra] for extra in extras] or [
+        project["dependencies"]
+    ]
+    return dict(
+        match.groups()
+        for entry in chain(*lists)
+        if (match := re.match(r"([\w-]+)>=([\w.]+)", entry))
+    )
 
 
 def paths_in(command):
     """Words of a shell command that name files of the repository."""
-    return re.findall(r"(?<![\w/.-])(?:tests|packaging|docs|\.github)/[\w./-]+|[\w-]+\.txt", command)
+    return re.findall(
+        r"(?<![\w/.-])(?:tests|packaging|docs|\.github)/[\w./-]+|[\w-]+\.txt", command
+    )
 
 
 @pytest.mark.parametrize(
@@ -51,7 +61,10 @@ def paths_in(command):
     ],
 )
 def test_every_file_names_the_version_of_the_citation(file, pattern):
-    assert re.search(pattern, text(file), flags=re.MULTILINE)[1] == yaml.safe_load(text("CITATION.cff"))["version"]
+    assert (
+        re.search(pattern, text(file), flags=re.MULTILINE)[1]
+        == yaml.safe_load(text("CITATION.cff"))["version"]
+    )
 
 
 def test_the_version_is_that_of_the_installation(monkeypatch):
@@ -65,11 +78,9 @@ def test_the_version_is_that_of_the_installation(monkeypatch):
 
 
 def test_the_records_for_citation_agree():
-    cited, archived, project = (
-        yaml.safe_load(text("CITATION.cff")),
-        json.loads(text(".zenodo.json")),
-        PROJECT["project"],
-    )
+    cited = yaml.safe_load(text("CITATION.cff"))
+    archived = json.loads(text(".zenodo.json"))
+    project = PROJECT["project"]
     assert archived["title"] == cited["title"]
     assert archived["version"] == cited["version"]
     assert archived["publication_date"] == str(cited["date-released"])
@@ -81,9 +92,15 @@ def test_the_records_for_citation_agree():
 
 
 def test_the_lowest_versions_are_the_bounds_and_every_dependency_has_one_in_the_constraints():
-    lowest = dict(re.findall(r"^([\w-]+)==(\S+)$", text("constraints-lowest.txt"), flags=re.MULTILINE))
-    expected = bounds() | bounds("bags", "control", "environments", "mujoco", "policies", "tags", "view", "test")
-    expected = {name: bound for name, bound in expected.items() if not name.startswith("setuptools")}
+    lowest = dict(
+        re.findall(r"^([\w-]+)==(\S+)$", text("constraints-lowest.txt"), flags=re.MULTILINE)
+    )
+    expected = bounds() | bounds(
+        "bags", "control", "environments", "mujoco", "policies", "tags", "view", "test"
+    )
+    expected = {
+        name: bound for name, bound in expected.items() if not name.startswith("setuptools")
+    }
     assert lowest.keys() == expected.keys()
     assert {name for name in lowest if lowest[name] != expected[name]} == NOT_TRIED
     fixed = set(re.findall(r"^([\w-]+)==", text("constraints.txt"), flags=re.MULTILINE))
@@ -94,9 +111,15 @@ def test_the_lowest_versions_are_the_bounds_and_every_dependency_has_one_in_the_
 def test_the_recipe_has_the_dependencies_of_the_package():
     recipe = yaml.safe_load(text("packaging/conda/recipe.yaml"))
     expected = {
-        CONDA_NAMES.get(name, name): bound for name, bound in bounds().items() if name not in ("cholespy", "mkl")
+        CONDA_NAMES.get(name, name): bound
+        for name, bound in bounds().items()
+        if name not in ("cholespy", "mkl")
     }
-    run = dict(entry.split(" >=") for entry in recipe["requirements"]["run"] if not entry.startswith("python "))
+    run = dict(
+        entry.split(" >=")
+        for entry in recipe["requirements"]["run"]
+        if not entry.startswith("python ")
+    )
     assert run == expected
     built_with = [entry.replace(" ", "") for entry in recipe["requirements"]["host"]]
     assert set(PROJECT["build-system"]["requires"]) <= set(built_with)
@@ -130,7 +153,8 @@ def test_a_container_copies_what_exists_and_has_no_rights(path):
 
 
 def test_the_paper_cites_what_exists_and_numbers_that_the_documentation_has():
-    paper, entries = text("paper/paper.md"), re.findall(r"^@\w+\{(\w+),$", text("paper/paper.bib"), flags=re.MULTILINE)
+    paper = text("paper/paper.md")
+    entries = re.findall(r"^@\w+\{(\w+),$", text("paper/paper.bib"), flags=re.MULTILINE)
     assert set(re.findall(r"(?<!\w)@(\w+)", paper)) == set(entries)
     sources = [REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md")]
     documented = "".join(path.read_text(encoding="utf-8") for path in sources)
@@ -154,4 +178,6 @@ def test_pages_of_the_api_have_the_first_sentences_of_their_modules_and_names():
     pages = runpy.run_path(str(REPOSITORY / "docs" / "extensions" / "api_pages.py"))["pages"]()
     assert len(pages) > 8
     for path, expected in pages.items():
-        assert path.read_text(encoding="utf-8") == expected, "run python docs/extensions/api_pages.py"
+        assert path.read_text(encoding="utf-8") == expected, (
+            "run python docs/extensions/api_pages.py"
+        )

@@ -38,10 +38,13 @@ def editor():
     return Draft202012Validator(schema)
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "conf" / "experiment").glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "conf" / "experiment").glob("*.yaml")), ids=lambda path: path.stem
+)
 def test_experiments_are_what_editors_expect(path, editor):
     content = OmegaConf.to_container(OmegaConf.load(path))
-    content = {key: group for key, group in content.items() if key not in ("mesh", "data")}  # their kind is elsewhere
+    # Their kind is elsewhere.
+    content = {key: group for key, group in content.items() if key not in ("mesh", "data")}
     editor.validate(content)
 
 
@@ -67,8 +70,15 @@ def test_choices_in_the_settings_are_those_in_the_code():
 def test_a_stage_has_the_keys_that_it_reads_alone():
     run = settings()
     stage = StageSettings.reading(run, "simulation", "law", "parallel.batch", shared="..")
-    assert (stage.simulation, stage.batch, stage.shared) == (run.simulation, run.parallel.batch, "..")
-    for key, read in {"seed": lambda: stage.seed, "processes": lambda: stage.parallel.processes}.items():
+    assert (stage.simulation, stage.batch, stage.shared) == (
+        run.simulation,
+        run.parallel.batch,
+        "..",
+    )
+    for key, read in {
+        "seed": lambda: stage.seed,
+        "processes": lambda: stage.parallel.processes,
+    }.items():
         with pytest.raises(AttributeError, match=key):
             read()
     with pytest.raises(AttributeError, match="identify"):

@@ -1,7 +1,7 @@
 """Differentiable soft-body simulation on NVIDIA Warp, with learned residual physics.
 
-The public names are in `names`, of which the first use imports all, so that importing the package is fast; further ones
-are in `mesh`, `energies`, `learning` and `pictures`.
+The public names are in `names`, of which the first use imports all, so that importing the package
+is fast; further ones are in `mesh`, `energies`, `learning` and `pictures`.
 """
 
 import importlib.util
@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from .io.process import collector_paused
 
-# In a copy of the repository without an editable installation, kernels/ and conf/ are next to this folder.
+# In a copy of the repository without an editable installation, kernels/ and conf/ are next to this
+# folder.
 if importlib.util.find_spec(f"{__name__}.kernels") is None:
     __path__.append(str(Path(__file__).parents[1]))
 
@@ -24,17 +25,26 @@ def _public(name: str) -> Any:
         return _version()
     if name in _PARTS:
         return import_module(f"{__name__}.{name}")
-    if name == "__all__" or (name[:1] != "_" and importlib.util.find_spec(f"{__name__}.{name}") is None):
+    if name == "__all__" or (
+        name[:1] != "_" and importlib.util.find_spec(f"{__name__}.{name}") is None
+    ):
         with collector_paused():
-            public = {key: value for key, value in vars(import_module(f"{__name__}.names")).items() if key[:1] != "_"}
+            public = {
+                key: value
+                for key, value in vars(import_module(f"{__name__}.names")).items()
+                if key[:1] != "_"
+            }
         if name == "__all__":
             return [*public]
         if name in public:
             return public[name]
         for part in _PARTS:
             if hasattr(import_module(f"{__name__}.{part}"), name):
-                raise AttributeError(f"module {__name__!r} has no attribute {name!r}: it is in {__name__}.{part}")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")  # A module is imported by its statement.
+                raise AttributeError(
+                    f"module {__name__!r} has no attribute {name!r}: it is in {__name__}.{part}"
+                )
+    # A module is imported by its statement.
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

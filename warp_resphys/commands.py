@@ -1,6 +1,7 @@
 """The commands of `warp-resphys`: parsing of command lines, and help.
 
-A command is one word or two: ``view``, ``view film``. This module imports only what is fast to import.
+A command is one word or two: ``view``, ``view film``. This module imports only what is fast to
+import.
 """
 
 from __future__ import annotations
@@ -20,14 +21,20 @@ from typing import Final
 from .io.errors import InputError, did_you_mean
 
 CONFIG_PACKAGE: Final = "warp_resphys.conf"
-OWN_OPTIONS: Final = "configs"  # in the working directory: groups of the configuration and their options
+OWN_OPTIONS: Final = (
+    "configs"  # in the working directory: groups of the configuration and their options
+)
 USER_ERROR: Final = 2  # exit code of an error that the user can fix
-NOBODY_READS: Final = 141  # exit code where the reader of the output has closed the pipe: 128 + SIGPIPE
+NOBODY_READS: Final = (
+    141  # exit code where the reader of the output has closed the pipe: 128 + SIGPIPE
+)
 
 
 @contextmanager
 def ends_where_nobody_reads() -> Iterator[None]:
-    """Ends the process silently when the reader of its output has closed the pipe, as `head` does."""
+    """Ends the process silently when the reader of its output has closed the pipe, as `head`
+    does.
+    """
     try:
         yield
         sys.stdout.flush()
@@ -35,7 +42,8 @@ def ends_where_nobody_reads() -> Iterator[None]:
         try:
             print(flush=True)  # Another pipe may have broken.
         except BrokenPipeError:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes again at exit.
+            # Python flushes again at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise SystemExit(NOBODY_READS) from None
         raise
 
@@ -46,8 +54,8 @@ class Command:
 
     Attributes:
         purpose: one line for the help.
-        function: such as ``studies.film:film``, below this package. Its arguments are the settings, an object of
-            the class that annotates this parameter, and the run folder.
+        function: such as ``studies.film:film``, below this package. Its arguments are the settings,
+            an object of the class that annotates this parameter, and the run folder.
         word: the configuration key that is set by one word after the command.
         words: the configuration key that is set by all words after the command, as a list.
     """
@@ -60,30 +68,53 @@ class Command:
 
 COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
     {
-        "run": Command("run an experiment; the word run may be left out", "pipeline:run_experiment"),
-        "tune": Command("search for better settings of the network and its training", "studies.tuning:tune"),
+        "run": Command(
+            "run an experiment; the word run may be left out", "pipeline:run_experiment"
+        ),
+        "tune": Command(
+            "search for better settings of the network and its training", "studies.tuning:tune"
+        ),
         "inspect": Command(
-            "what is in a mesh, or how good a recording is", "studies.inspection:inspect", words="files"
+            "what is in a mesh, or how good a recording is",
+            "studies.inspection:inspect",
+            words="files",
         ),
         "convert": Command(
             "recordings, such as bags, MCAP files and exported tables, to HDF5",
             "studies.recording_quality:convert",
             words="files",
         ),
-        "view": Command("a run's robot in the browser, to be driven and pulled", "studies.view:view", word="run"),
-        "view film": Command("a film of a trial of a run, with any of its models", "studies.film:film", word="run"),
+        "view": Command(
+            "a run's robot in the browser, to be driven and pulled", "studies.view:view", word="run"
+        ),
+        "view film": Command(
+            "a film of a trial of a run, with any of its models", "studies.film:film", word="run"
+        ),
         "check": Command(
-            "compare a device with the CPU, and time both, in two minutes", "studies.check:check", word="device"
+            "compare a device with the CPU, and time both, in two minutes",
+            "studies.check:check",
+            word="device",
         ),
         "train-policy": Command(
-            "learn a policy on a run's robot, and try it on its laboratory", "studies.policy:train_policy", word="run"
+            "learn a policy on a run's robot, and try it on its laboratory",
+            "studies.policy:train_policy",
+            word="run",
         ),
     }
 )
 
 # Hydra's options whose next word is their value.
 VALUED: Final = (
-    *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
+    "--cfg",
+    "-c",
+    "--package",
+    "-p",
+    "--config-path",
+    "-cp",
+    "--config-name",
+    "-cn",
+    "--config-dir",
+    "-cd",
     *("--info", "-i", "--experimental-rerun"),
 )
 _LABEL_LENGTH: Final = 100
@@ -106,7 +137,9 @@ def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
         InputError: there is no such command.
     """
     rest = list(arguments)
-    words = [at for at, argument in enumerate(rest) if _is_word(argument, rest[at - 1] if at else "")]
+    words = [
+        at for at, argument in enumerate(rest) if _is_word(argument, rest[at - 1] if at else "")
+    ]
     name = rest[words[0]] if words else "run"
     if name not in COMMANDS:
         firsts = [command for command in COMMANDS if " " not in command]
@@ -116,8 +149,13 @@ def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
     if len(words) > 1 and rest[words[1]] in parts:
         name, named = f"{name} {rest[words[1]]}", words[:2]
     command = COMMANDS[name]
-    if command.word or command.words:  # Names of files may be like options or overrides: m=50g.csv, -1.csv, ~a.csv.
-        files = [at for at in range(named[-1] + 1, len(rest)) if os.path.exists(rest[at]) or _is_path(rest[at])]
+    if command.word or command.words:
+        # Names of files may be like options or overrides: m=50g.csv, -1.csv, ~a.csv.
+        files = [
+            at
+            for at in range(named[-1] + 1, len(rest))
+            if os.path.exists(rest[at]) or _is_path(rest[at])
+        ]
         words = sorted({*words, *(at for at in files if rest[at - 1] not in VALUED)})
     after = [at for at in words if at not in named]
     dropped, quoted = set(named), [quote_name(rest[at]) for at in after]
@@ -135,33 +173,68 @@ def _is_word(argument: str, before: str) -> bool:
 
 
 def _is_path(argument: str) -> bool:
-    """Whether an argument has a folder before its first ``=``, as in monday/m=50g.csv, which no key has."""
-    return argument[:1] not in ("-", "+", "~") and "/" in argument.partition("=")[0].removeprefix("hydra/")
+    """Whether an argument has a folder before its first ``=``,
+    as in monday/m=50g.csv, which no key has.
+    """
+    return argument[:1] not in ("-", "+", "~") and "/" in argument.partition("=")[0].removeprefix(
+        "hydra/"
+    )
 
 
 def quote(text: str) -> str:
     """Returns a text in quotes, as Hydra reads it unchanged."""
-    return "'" + re.sub(r"(\\*)('|\Z)", lambda found: found[1] * 2 + (r"\'" if found[2] else ""), text) + "'"
+    return (
+        "'"
+        + re.sub(r"(\\*)('|\Z)", lambda found: found[1] * 2 + (r"\'" if found[2] else ""), text)
+        + "'"
+    )
 
 
 def quote_name(name: str) -> str:
-    """Returns the name of a file or folder in quotes; in one that exists, ``${`` and a first ``~`` are letters."""
+    """Returns the name of a file or folder in quotes.
+
+    In one that exists, ``${`` and a first ``~`` are letters.
+    """
     if os.path.exists(name):
         name = (os.path.abspath(name) if name[:1] == "~" else name).replace("${", r"\${")
     return quote(name)
 
 
 def help_text(command: str) -> str:
-    """Returns the help of a command: purpose, examples and keys; for a run, all commands, groups and options."""
+    """Returns the help of a command: purpose, examples and keys.
+
+    For a run, all commands, groups and options.
+    """
     import yaml
 
-    text = resources.files(CONFIG_PACKAGE).joinpath(f"{configuration(command)}.yaml").read_text(encoding="utf-8")
+    text = (
+        resources.files(CONFIG_PACKAGE)
+        .joinpath(f"{configuration(command)}.yaml")
+        .read_text(encoding="utf-8")
+    )
     content = yaml.safe_load(text)
     examples = content["hydra"]["help"]["header"]
     if command == "run":
-        return "\n".join([*_lines(COMMANDS), "", examples, "Groups and their options:", "", *_groups(), "", _OPTIONS])
+        return "\n".join(
+            [
+                *_lines(COMMANDS),
+                "",
+                examples,
+                "Groups and their options:",
+                "",
+                *_groups(),
+                "",
+                _OPTIONS,
+            ]
+        )
     parts = {name: part for name, part in COMMANDS.items() if name.startswith(f"{command} ")}
-    head = [f"warp-resphys {command}: {COMMANDS[command].purpose}", "", *_lines(parts), *[""][: len(parts)], examples]
+    head = [
+        f"warp-resphys {command}: {COMMANDS[command].purpose}",
+        "",
+        *_lines(parts),
+        *[""][: len(parts)],
+        examples,
+    ]
     groups = [
         f"{group}={option}"
         for entry in content["defaults"]
@@ -170,9 +243,19 @@ def help_text(command: str) -> str:
     ]
     if "config" in content["defaults"]:
         groups.append("all groups and keys of a run, as warp-resphys --help lists them")
-    keys = re.sub(r"^(?:defaults|hydra):\n(?:(?: .*)?(?:\n|\Z))*", "", text, flags=re.MULTILINE).rstrip()
+    keys = re.sub(
+        r"^(?:defaults|hydra):\n(?:(?: .*)?(?:\n|\Z))*", "", text, flags=re.MULTILINE
+    ).rstrip()
     return "\n".join(
-        [*head, "Keys and their values:", "", keys, *[f"# also: {', '.join(groups)}"][: len(groups)], "", _OPTIONS]
+        [
+            *head,
+            "Keys and their values:",
+            "",
+            keys,
+            *[f"# also: {', '.join(groups)}"][: len(groups)],
+            "",
+            _OPTIONS,
+        ]
     )
 
 
@@ -198,11 +281,12 @@ def run_label(overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
 
     Args:
         overrides: Hydra's task overrides, such as "material.density=900".
-        excluded: Keys that do not change the results, or that are part of the path already, with all keys below them.
+        excluded: Keys that do not change the results, or that are part of the path already, with
+            all keys below them.
 
     Returns:
-        "key=value,key=value" sorted by key, or "default" without overrides. Long names, and names with unsuitable
-        characters, are shortened or replaced and end in a hash of the whole.
+        "key=value,key=value" sorted by key, or "default" without overrides. Long names, and names
+        with unsuitable characters, are shortened or replaced and end in a hash of the whole.
     """
     settings = {}
     for override in overrides:

@@ -18,14 +18,27 @@ from typing import Any, Final, get_type_hints
 
 from hydra._internal.utils import _run_hydra, get_args_parser
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, InstantiationException, MissingConfigException, OverrideParseException
+from hydra.errors import (
+    HydraException,
+    InstantiationException,
+    MissingConfigException,
+    OverrideParseException,
+)
 from hydra.types import RunMode
 from hydra.version import setbase
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from yaml import MarkedYAMLError
 
-from .commands import CONFIG_PACKAGE, OWN_OPTIONS, USER_ERROR, configuration, ends_where_nobody_reads, quote, run_label
+from .commands import (
+    CONFIG_PACKAGE,
+    OWN_OPTIONS,
+    USER_ERROR,
+    configuration,
+    ends_where_nobody_reads,
+    quote,
+    run_label,
+)
 from .io.atomic import is_disk_full
 from .io.errors import ResphysError, ResphysWarning, did_you_mean
 from .io.process import collector_paused, ends_as_after_ctrl_c
@@ -47,8 +60,8 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
 
     Args:
         command: name of the command.
-        function: its module below this package and its function, such as "studies.film:film". The configuration
-            is parsed into the class that annotates its first parameter.
+        function: its module below this package and its function, such as "studies.film:film". The
+            configuration is parsed into the class that annotates its first parameter.
         arguments: for Hydra.
     """
     job = _Job(function, os.environ.get("HYDRA_FULL_ERROR") == "1")
@@ -64,7 +77,9 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
 
 
 class _Job:
-    """A command that Hydra runs, once or for every job of a sweep; it reports errors in one sentence.
+    """A command that Hydra runs, once or for every job of a sweep.
+
+    It reports errors in one sentence.
 
     Args:
         function: see `launch`.
@@ -83,17 +98,27 @@ class _Job:
         parser = get_args_parser()
         parsed = parser.parse_intermixed_args([*_user_options(), *arguments])
         if parsed.experimental_rerun is not None:
-            raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides instead")
+            raise HydraException(
+                "--experimental-rerun reads a pickle, which can run code: use overrides instead"
+            )
         if command in TYPED and parsed.cfg == "job":
             self.shown, parsed.cfg = parsed.package or "", None
         if parsed.overrides:
-            schema = run_schema() if command in TYPED else _function(self.function)[1].model_json_schema()
-            parsed.overrides, self.late = readable(parsed.overrides, schema, parsed.config_dir, parsed.multirun)
+            schema = (
+                run_schema()
+                if command in TYPED
+                else _function(self.function)[1].model_json_schema()
+            )
+            parsed.overrides, self.late = readable(
+                parsed.overrides, schema, parsed.config_dir, parsed.multirun
+            )
         parsed.overrides += _SILENT if self.shown is not None else ()
         OmegaConf.register_new_resolver("run_label", self._label, replace=True)
         setbase("1.3")
         with ends_as_after_ctrl_c(), names_are_texts():
-            _run_hydra(parsed, parser, self._call, f"pkg://{CONFIG_PACKAGE}", configuration(command))
+            _run_hydra(
+                parsed, parser, self._call, f"pkg://{CONFIG_PACKAGE}", configuration(command)
+            )
 
     def _label(self, overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
         return run_label([*overrides, *(override.argument for override in self.late)], excluded)
@@ -130,7 +155,9 @@ class _Job:
 
 @contextmanager
 def _one_sentence_each() -> Iterator[None]:
-    """Lets errors and warnings have one sentence each, without lines of code; restores the process at the end.
+    """Lets errors and warnings have one sentence each, without lines of code.
+
+    Restores the process at the end.
 
     Of warnings that differ in numbers alone, as of one body in several stages, the first is shown.
     """
@@ -144,7 +171,9 @@ def _one_sentence_each() -> Iterator[None]:
         yield
     finally:
         warnings.formatwarning, logging.raiseExceptions, full_error = before
-        os.environ.pop("HYDRA_FULL_ERROR") if full_error is None else os.environ.update(HYDRA_FULL_ERROR=full_error)
+        os.environ.pop("HYDRA_FULL_ERROR") if full_error is None else os.environ.update(
+            HYDRA_FULL_ERROR=full_error
+        )
 
 
 def _function(name: str) -> tuple[Callable[..., Any], type[Settings]]:
@@ -164,7 +193,10 @@ def _sentence_of_warning(
     lineno: int,
     line: str | None = None,
 ) -> str:
-    """A warning as `warnings.formatwarning` returns it; those of this package without a line of code, each once."""
+    """A warning as `warnings.formatwarning` returns it.
+
+    Those of this package without a line of code, each once.
+    """
     if issubclass(category, ResphysWarning):
         before = len(shown)
         shown.add(_NUMBER.sub("", str(message)))
@@ -173,7 +205,10 @@ def _sentence_of_warning(
 
 
 def _user_options() -> list[str]:
-    """Arguments that add the folder of the user's own options, if it exists; a later --config-dir replaces it."""
+    """Arguments that add the folder of the user's own options, if it exists.
+
+    A later --config-dir replaces it.
+    """
     folder = Path.cwd() / OWN_OPTIONS
     if not folder.is_dir():
         return []
@@ -181,7 +216,10 @@ def _user_options() -> list[str]:
     for path in sorted(folder.glob("*/*.yaml")):
         name = path.relative_to(Path.cwd())
         if packaged.joinpath(path.parent.name, path.name).is_file():
-            print(f"warning: {name} is ignored: the package has an option of that name", file=sys.stderr)
+            print(
+                f"warning: {name} is ignored: the package has an option of that name",
+                file=sys.stderr,
+            )
     return ["--config-dir", str(folder)]
 
 
@@ -206,17 +244,30 @@ def _explain(error: BaseException, started: bool) -> str | None:
         return None
     if isinstance(error, InstantiationException) and cause is not None:
         return _explain(cause, started)
-    if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None and error.options:
+    if (
+        isinstance(error, MissingConfigException)
+        and error.missing_cfg_file is not None
+        and error.options
+    ):
         group, _, option = error.missing_cfg_file.rpartition("/")
-        return f"unknown {group} '{option}'{did_you_mean(option, error.options)}; known are {', '.join(error.options)}"
+        return (
+            f"unknown {group} '{option}'{did_you_mean(option, error.options)}; known are "
+            f"{', '.join(error.options)}"
+        )
     if isinstance(error, OverrideParseException):
         override = error.override.removeprefix("++")
         key, equals, value = override.partition("=")
         text = quote(value) if '"' in value else f'"{value}"'
-        hint = f", and a text with special characters in quotes, {shlex.quote(f'{key}={text}')}" if equals else ""
+        hint = (
+            f", and a text with special characters in quotes, {shlex.quote(f'{key}={text}')}"
+            if equals
+            else ""
+        )
         return f"cannot read the override {override!r} ({_sentence(error)}): write key=value{hint}"
     if isinstance(error, MissingMandatoryValue):
-        return f"{error.full_key} has no value: add {error.full_key}=VALUE (--help explains the keys)"
+        return (
+            f"{error.full_key} has no value: add {error.full_key}=VALUE (--help explains the keys)"
+        )
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return _sentence(error)
     if is_disk_full(error):
@@ -228,7 +279,10 @@ def _explain(error: BaseException, started: bool) -> str | None:
     if isinstance(error, MarkedYAMLError):
         mark = error.problem_mark
         place = "a configuration" if mark is None else f"{mark.name}, line {mark.line + 1}"
-        return f"{place} cannot be read as YAML ({error.problem}): correct this line or the lines before"
+        return (
+            f"{place} cannot be read as YAML ({error.problem}): "
+            "correct this line or the lines before"
+        )
     if isinstance(error, OSError):
         return f"cannot write {error.filename} ({error.strerror}): choose another run folder"
     return _sentence(error) if isinstance(error, ValueError) else None
@@ -236,9 +290,15 @@ def _explain(error: BaseException, started: bool) -> str | None:
 
 def _sentence(error: BaseException) -> str:
     """Message of a library error in one line, without lists of search paths and types."""
-    text = re.split(r"\n\s*(?:Config search|Search path|full_key|object_type|reference_type|See )", str(error))[0]
+    text = re.split(
+        r"\n\s*(?:Config search|Search path|full_key|object_type|reference_type|See )", str(error)
+    )[0]
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    if isinstance(error, OmegaConfBaseException) and error.full_key and error.full_key not in lines[0]:
+    if (
+        isinstance(error, OmegaConfBaseException)
+        and error.full_key
+        and error.full_key not in lines[0]
+    ):
         lines.append(f"(at {error.full_key})")
     if isinstance(error.__cause__, (OmegaConfBaseException, ResphysError)):
         lines.append(f"({_sentence(error.__cause__)})")

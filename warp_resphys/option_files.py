@@ -1,10 +1,12 @@
-"""YAML files of configuration groups as Hydra reads them, with names that stay as they were written.
+"""YAML files of configuration groups as Hydra reads them,
+with names that stay as they were written.
 
-YAML reads ``001``, ``on`` and ``1e3`` as numbers and truth values. Here all keys are texts, and so are values of keys
-that take text alone, by the JSON Schema of a run's settings.
+YAML reads ``001``, ``on`` and ``1e3`` as numbers and truth values. Here all keys are texts, and so
+are values of keys that take text alone, by the JSON Schema of a run's settings.
 
-Hydra merges a group with those of the files before it. With ``_replace_: true`` in it, it replaces them: directly
-before such a file, Hydra also reads a file ``NAME.emptying`` that does not exist, in which these groups are null.
+Hydra merges a group with those of the files before it. With ``_replace_: true`` in it, it replaces
+them: directly before such a file, Hydra also reads a file ``NAME.emptying`` that does not exist, in
+which these groups are null.
 """
 
 from __future__ import annotations
@@ -45,7 +47,9 @@ class _OptionSource(file_config_source.FileConfigSource):
         text = read_text(path)
         header = self._get_header_dict(text)
         package = header["package"] or name.rpartition("/")[0].replace("/", ".")
-        quoted = _with_quotes(text, () if package == "_global_" else tuple(package.split(".")), path)
+        quoted = _with_quotes(
+            text, () if package == "_global_" else tuple(package.split(".")), path
+        )
         values: Any = OmegaConf.to_container(OmegaConf.load(_stream(quoted, path)))
         replaced = _without_marks(values) if isinstance(values, dict) else {}
         if name != config_path:
@@ -53,12 +57,20 @@ class _OptionSource(file_config_source.FileConfigSource):
         elif replaced:
             _add_before(values, name.rpartition("/")[2] + _EMPTYING)
         config = OmegaConf.create(values)
-        return ConfigResult(config=config, path=f"{self.scheme()}://{self.path}", provider=self.provider, header=header)
+        return ConfigResult(
+            config=config,
+            path=f"{self.scheme()}://{self.path}",
+            provider=self.provider,
+            header=header,
+        )
 
 
 @contextmanager
 def names_are_texts() -> Iterator[None]:
-    """Lets Hydra read the files of folders as this module describes; its registry of sources is restored at the end."""
+    """Lets Hydra read the files of folders as this module describes.
+
+    Its registry of sources is restored at the end.
+    """
     Plugins.instance()  # registers Hydra's sources
     sources, scheme = SourcesRegistry.instance().types, _OptionSource.scheme()
     before, sources[scheme] = sources[scheme], _OptionSource
@@ -98,7 +110,9 @@ def _stream(text: str, path: Path) -> io.StringIO:
 
 
 def _texts(node: yaml.Node | None, path: KeyPath) -> Iterator[yaml.ScalarNode]:
-    """Yields the keys, and the values that are texts, of the part of a file that stands at a path of the settings."""
+    """Yields the keys, and the values that are texts,
+    of the part of a file that stands at a path of the settings.
+    """
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:
             yield from [key] if isinstance(key, yaml.ScalarNode) else []
@@ -111,7 +125,9 @@ def _texts(node: yaml.Node | None, path: KeyPath) -> Iterator[yaml.ScalarNode]:
 
 
 def _without_marks(values: dict[str, Any]) -> dict[str, Any]:
-    """Removes the marks of groups that replace others, and returns these groups with null in place of their keys."""
+    """Removes the marks of groups that replace others,
+    and returns these groups with null in place of their keys.
+    """
     replaced: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, dict):
@@ -122,8 +138,13 @@ def _without_marks(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _add_before(values: dict[str, Any], file: str) -> None:
-    """Adds a file to the defaults list, directly before the file that has the list; overrides stay at its end."""
+    """Adds a file to the defaults list, directly before the file that has the list.
+
+    Overrides stay at its end.
+    """
     defaults = values.setdefault("defaults", [])
     defaults += [] if "_self_" in defaults else ["_self_"]
-    at_its_end = [entry == "_self_" or str(next(iter(entry))).startswith("override ") for entry in defaults]
+    at_its_end = [
+        entry == "_self_" or str(next(iter(entry))).startswith("override ") for entry in defaults
+    ]
     defaults.insert(at_its_end.index(True), file)

@@ -1,8 +1,9 @@
 """Arguments for Hydra in which names and paths stay as they were typed.
 
-Hydra reads ``20261128``, ``1e5`` and ``null`` as numbers and null, commas and brackets as sweeps and lists, and no
-letter beyond ASCII. Values of keys that take text alone, by the JSON Schema of the settings, are put in quotes.
-Overrides whose keys Hydra cannot read, such as ``data.trials.001.payload=0.05``, change the composed configuration.
+Hydra reads ``20261128``, ``1e5`` and ``null`` as numbers and null, commas and brackets as sweeps
+and lists, and no letter beyond ASCII. Values of keys that take text alone, by the JSON Schema of
+the settings, are put in quotes. Overrides whose keys Hydra cannot read, such as
+``data.trials.001.payload=0.05``, change the composed configuration.
 """
 
 from __future__ import annotations
@@ -26,14 +27,21 @@ from .commands import CONFIG_PACKAGE, quote, quote_name
 from .io.errors import InputError
 from .io.setting_errors import Schema, is_text
 
-# A text that Hydra reads as such, a part of a key that it reads, a text in quotes, and a call of a function.
-_PLAIN: Final = re.compile(r"(?!(?:true|false|null|inf|nan)\Z)(?:\.{0,2}/)?[a-z_][\w./-]*", re.ASCII | re.IGNORECASE)
+# A text that Hydra reads as such, a part of a key that it reads, a text in quotes, and a call of a
+# function.
+_PLAIN: Final = re.compile(
+    r"(?!(?:true|false|null|inf|nan)\Z)(?:\.{0,2}/)?[a-z_][\w./-]*", re.ASCII | re.IGNORECASE
+)
 _KEY: Final = re.compile(r"[a-z_$][\w$-]*|0|[1-9]\d*", re.ASCII | re.IGNORECASE)
 _QUOTED: Final = re.compile(r"""'(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*\"""")
-_CALL: Final = re.compile(r"(?:bool|choice|float|glob|int|interval|range|shuffle|sort|str|tag)\(.*\)")
+_CALL: Final = re.compile(
+    r"(?:bool|choice|float|glob|int|interval|range|shuffle|sort|str|tag)\(.*\)"
+)
 _PAIR: Final = re.compile(rf"\s*({_QUOTED.pattern}|[^:]*?)\s*:\s*(.*)", re.DOTALL)
 _CLOSING: Final = {"[": "]", "{": "}", "(": ")", "'": "'", '"': '"'}
-_BUDGETS: Final = "budget_on"  # group of options: what a budget changes for one origin of the trials
+_BUDGETS: Final = (
+    "budget_on"  # group of options: what a budget changes for one origin of the trials
+)
 _HYDRA_TEXTS: Final = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir", "hydra.job.name")
 
 
@@ -68,12 +76,19 @@ class LateOverride:
                 return
             override = OverridesParser.create().parse_override(f"value={self.value}")
             if override.is_sweep_override():
-                raise InputError(f"cannot sweep over {'.'.join(self.path)}: choose a name of letters and digits.")
-            config.merge_with(reduce(lambda inner, name: {name: inner}, reversed(self.path), override.value()))
+                raise InputError(
+                    f"cannot sweep over {'.'.join(self.path)}: choose a name of letters and digits."
+                )
+            config.merge_with(
+                reduce(lambda inner, name: {name: inner}, reversed(self.path), override.value())
+            )
 
 
 def readable(
-    arguments: Sequence[str], schema: Schema = MappingProxyType({}), config_dir: str | None = None, sweeps: bool = False
+    arguments: Sequence[str],
+    schema: Schema = MappingProxyType({}),
+    config_dir: str | None = None,
+    sweeps: bool = False,
 ) -> tuple[list[str], list[LateOverride]]:
     """Returns overrides as Hydra reads them, and those that change the composed configuration.
 
@@ -86,7 +101,13 @@ def readable(
         sweeps: whether commas separate the values of a sweep.
     """
     folders = [resources.files(CONFIG_PACKAGE), *([] if config_dir is None else [Path(config_dir)])]
-    groups = {entry.name for folder in folders if folder.is_dir() for entry in folder.iterdir() if entry.is_dir()}
+    groups = {
+        entry.name
+        for folder in folders
+        if folder.is_dir()
+        for entry in folder.iterdir()
+        if entry.is_dir()
+    }
     reader = _Reader(schema, groups, sweeps)
     overrides = [override for argument in arguments for override in reader.overrides(argument)]
     late = [override for override in overrides if isinstance(override, LateOverride)]
@@ -94,7 +115,9 @@ def readable(
 
 
 def composed(name: str, arguments: Sequence[str] = ()) -> Any:
-    """Returns the values of a configuration, such as ``config`` for a run, as a command line composes them."""
+    """Returns the values of a configuration, such as ``config`` for a run,
+    as a command line composes them.
+    """
     words, late = readable(arguments)
     with initialize_config_module(CONFIG_PACKAGE, version_base="1.3"):
         config = compose(name, words, return_hydra_config=True)
@@ -107,7 +130,8 @@ def composed(name: str, arguments: Sequence[str] = ()) -> Any:
 def adjust(config: DictConfig, choices: Mapping[str, str], late: Sequence[LateOverride]) -> None:
     """Changes a configuration that Hydra has composed from chosen options.
 
-    A group that an experiment set to null stays null: Hydra gives it what a budget changes in it, and nothing else.
+    A group that an experiment set to null stays null: Hydra gives it what a budget changes in it,
+    and nothing else.
     """
     change = resources.files(CONFIG_PACKAGE) / _BUDGETS / f"{choices.get(_BUDGETS)}.yaml"
     changed: Any = OmegaConf.create(change.read_text(encoding="utf-8")) if change.is_file() else {}
@@ -133,19 +157,29 @@ class _Reader:
     sweeps: bool
 
     def overrides(self, argument: str) -> Iterator[str | LateOverride]:
-        """Yields an override, or one for each name of a dictionary with names that Hydra would change."""
+        """Yields an override, or one for each name of a dictionary with names
+        that Hydra would change.
+        """
         mark = argument[: len(argument) - len(argument.lstrip("+~"))]
         key, equals, value = argument.removeprefix(mark).partition("=")
         if "/" in key or "@" in key or not (equals or mark == "~"):
             yield argument
         elif key in self.groups and value[:1] != "{":
-            kept = mark == "~" or value[:1] == "[" or ("," in value and not self.sweeps and not os.path.exists(value))
+            kept = (
+                mark == "~"
+                or value[:1] == "["
+                or ("," in value and not self.sweeps and not os.path.exists(value))
+            )
             yield argument if kept else f"{mark}{key}={self._swept(value, ('defaults', key))}"
         else:
             path = tuple(key.split("."))
-            yield from self._spread(mark or "++" * (path[0] != "hydra"), path, value if equals else None)
+            yield from self._spread(
+                mark or "++" * (path[0] != "hydra"), path, value if equals else None
+            )
 
-    def _spread(self, mark: str, path: tuple[str, ...], value: str | None) -> Iterator[str | LateOverride]:
+    def _spread(
+        self, mark: str, path: tuple[str, ...], value: str | None
+    ) -> Iterator[str | LateOverride]:
         if value is not None and _has_special_names(value):
             for name, member in _pairs(value):
                 name = name[1:-1] if _QUOTED.fullmatch(name) else name
@@ -169,10 +203,15 @@ class _Reader:
             return _text(value)
         if value[:1] == "[" and (items := _members(value)):
             whole = value[1:-1]
-            items = [whole] if is_text(self.schema, (*path, 0), whole) and os.path.exists(whole) else items
+            items = (
+                [whole]
+                if is_text(self.schema, (*path, 0), whole) and os.path.exists(whole)
+                else items
+            )
             return f"[{','.join(self._value(item, (*path, at)) for at, item in enumerate(items))}]"
         if value[:1] == "{" and (pairs := _pairs(value)):
-            return f"{{{','.join(f'{name}:{self._value(member, (*path, name))}' for name, member in pairs)}}}"
+            members = [f"{name}:{self._value(member, (*path, name))}" for name, member in pairs]
+            return f"{{{','.join(members)}}}"
         return value if value[:1] in (*_CLOSING, "") or _is_readable(value) else quote(value)
 
 
@@ -195,17 +234,24 @@ def _is_readable(value: str) -> bool:
 
 def _has_special_names(value: str) -> bool:
     """Whether a dictionary has names that Hydra would change or refuse, at any depth."""
-    return any(not _PLAIN.fullmatch(name) or _has_special_names(member) for name, member in _pairs(value))
+    return any(
+        not _PLAIN.fullmatch(name) or _has_special_names(member) for name, member in _pairs(value)
+    )
 
 
 def _pairs(value: str) -> list[tuple[str, str]]:
     """Names and values of a dictionary in Hydra's syntax; nothing of another value."""
-    pairs = [_PAIR.fullmatch(member) for member in _members(value) or ()] if value[:1] == "{" else []
+    pairs = (
+        [_PAIR.fullmatch(member) for member in _members(value) or ()] if value[:1] == "{" else []
+    )
     return [(pair[1], pair[2]) for pair in pairs if pair] if all(pairs) else []
 
 
 def _members(value: str) -> list[str] | None:
-    """Splits a list or a dictionary at commas outside of quotes and brackets; None where one of these is open."""
+    """Splits a list or a dictionary at commas outside of quotes and brackets.
+
+    None where one of these is open.
+    """
     if not value[1:-1].strip():
         return []
     members, opened, start = [], [value[0]], 1

@@ -1,4 +1,5 @@
-"""Pages of the API for readers of Markdown: below the heading of a module, its first sentence and its names.
+"""Pages of the API for readers of Markdown: below the heading of a module,
+its first sentence and its names.
 
 python docs/extensions/api_pages.py
 """
@@ -16,13 +17,22 @@ _LITERAL = re.compile(r"(``.+?``|`.+?`)")
 
 def pages() -> dict[Path, str]:
     """Returns the pages with modules, as they should read."""
-    texts = {path: path.read_text(encoding="utf-8") for path in (_REPOSITORY / "docs" / "api").glob("*.md")}
-    return {path: _MODULE.sub(_described, text) for path, text in texts.items() if _MODULE.search(text)}
+    texts = {
+        path: path.read_text(encoding="utf-8")
+        for path in (_REPOSITORY / "docs" / "api").glob("*.md")
+    }
+    return {
+        path: _MODULE.sub(_described, text) for path, text in texts.items() if _MODULE.search(text)
+    }
 
 
 def _described(heading: re.Match[str]) -> str:
-    """The heading of a module with the first line of its docstring and a table of its public names."""
-    tree = ast.parse(_REPOSITORY.joinpath(*heading[1].split(".")).with_suffix(".py").read_text(encoding="utf-8"))
+    """The heading of a module with the first line of its docstring
+    and a table of its public names.
+    """
+    tree = ast.parse(
+        _REPOSITORY.joinpath(*heading[1].split(".")).with_suffix(".py").read_text(encoding="utf-8")
+    )
     rows = [f"| `{name}` | {_markdown(meaning)} |" for name, meaning in _documented(tree)]
     table = "\n".join(["| name | purpose |", "|---|---|", *rows])
     return f"## `{heading[1]}`\n\n{_first_line(tree)}\n\n" + (f"{table}\n\n" if rows else "")

@@ -1,4 +1,5 @@
-"""Tutorials as notebooks: next to the page of each tutorial its notebook, with a link below the title.
+"""Tutorials as notebooks: next to the page of each tutorial its notebook,
+with a link below the title.
 
 They are short in a book that is built with the environment variable `WARP_RESPHYS_TUTORIALS=short`.
 """
@@ -32,16 +33,23 @@ def write_notebooks(app: Sphinx, error: Exception | None) -> None:
             jupytext.write(read(path.read_text(encoding="utf-8")), target)
 
 
-def link_notebook(app: Sphinx, page: str, _template: str, context: dict[str, Any], _doctree: Any) -> None:
+def link_notebook(
+    app: Sphinx, page: str, _template: str, context: dict[str, Any], _doctree: Any
+) -> None:
     """Adds the link to the notebook below the title of a tutorial."""
     for path in tutorials(app):
         if page == f"tutorials/{path.stem}" and "body" in context:
-            link = f'<p class="notebook"><a href="{path.stem}.ipynb" download>Download this page as a notebook</a></p>'
+            link = (
+                f'<p class="notebook"><a href="{path.stem}.ipynb" download>Download this page as '
+                "a notebook</a></p>"
+            )
             context["body"] = context["body"].replace("</h1>", f"</h1>\n{link}", 1)
 
 
 def spread_tutorials(app: Sphinx, _environment: Any, pages: list[str]) -> None:
-    """Orders the pages such that processes that read neighbouring pages run equally many tutorials."""
+    """Orders the pages such that processes that read neighbouring pages run equally many
+    tutorials.
+    """
     slow = {f"tutorials/{path.stem}" for path in tutorials(app)}
     groups = [[page for page in pages if (page in slow) is among] for among in (True, False)]
     place = {page: number / len(group) for group in groups for number, page in enumerate(group)}

@@ -16,18 +16,20 @@ from warp_resphys.settings.run import RunSettings
 _HEAD: Final = """# Settings
 
 All keys of a run: `key=default`, its meaning, and its values with their unit [in brackets].
-[Your robot](bring_your_robot.md) shows the few that a configuration needs. Set one with `key=value` on the command
-line, or in a file of `configs/experiment`; `warp-resphys --cfg job` shows the values of a run. `NAME` stands for any
-name. A key without a default is required. Keys of `simfree` that are left out are as in `network` and `trainer`.
+[Your robot](bring_your_robot.md) shows the few that a configuration needs. Set one with `key=value`
+on the command line, or in a file of `configs/experiment`; `warp-resphys --cfg job` shows the values
+of a run. `NAME` stands for any name. A key without a default is required. Keys of `simfree` that
+are left out are as in `network` and `trainer`.
 
-`python -m warp_resphys.settings.editor_schema configs/settings.schema.json` writes a JSON Schema, with which editors
-complete and check YAML files that begin with `# yaml-language-server: $schema=../settings.schema.json`.
+`python -m warp_resphys.settings.editor_schema configs/settings.schema.json` writes a JSON Schema,
+with which editors complete and check YAML files that begin with
+`# yaml-language-server: $schema=../settings.schema.json`.
 `python docs/extensions/settings_page.py` writes this page.
 """
 
 _REPLACED: Final = (
-    "It may have the keys {} of the run, and `material` with the keys of `simulation`: each replaces the simulator's "
-    "as a whole."
+    "It may have the keys {} of the run, and `material` with the keys of `simulation`: each "
+    "replaces the simulator's as a whole."
 )
 _OF_SHAPE: Final = "It has the keys {} of a body, of which `mesh` and `fixed` are required."
 _TYPES: Final = {"object": "group", "boolean": "true/false", "string": "word"}
@@ -39,7 +41,9 @@ def page() -> str:
     return "\n".join([_HEAD, *_sections(schema, schema, "", "", {})])
 
 
-def _sections(schema: Schema, node: Schema, path: str, default: str, shown: dict[str, str]) -> Iterator[str]:
+def _sections(
+    schema: Schema, node: Schema, path: str, default: str, shown: dict[str, str]
+) -> Iterator[str]:
     """Yields a section for a group, one for each of its kinds, and those of the groups in it.
 
     Args:
@@ -51,7 +55,11 @@ def _sections(schema: Schema, node: Schema, path: str, default: str, shown: dict
     """
     kinds = [kind for kind in options(schema, node) if "properties" in kind]
     every = [kind["properties"] for kind in kinds]
-    common = {name: key for name, key in every[0].items() if all(other.get(name) == key for other in every)}
+    common = {
+        name: key
+        for name, key in every[0].items()
+        if all(other.get(name) == key for other in every)
+    }
     inherited = _inherited(path)
     below: list[tuple[Schema, str, str]] = []
 
@@ -60,17 +68,24 @@ def _sections(schema: Schema, node: Schema, path: str, default: str, shown: dict
         for name, key in members.items():
             if name in inherited or ("const" in key and kinds[1:]):
                 continue
-            values, group = _values(key, schema), _group(schema, key, f"{path}.{name}".removeprefix("."))
+            values, group = (
+                _values(key, schema),
+                _group(schema, key, f"{path}.{name}".removeprefix(".")),
+            )
             if group is not None:
                 inner, at = group
-                content = json.dumps([option["title"] for option in options(schema, inner) if "title" in option])
+                content = json.dumps(
+                    [option["title"] for option in options(schema, inner) if "title" in option]
+                )
                 if content not in shown:
                     shown[content] = at
                     below.append((inner, at, "Required. " if name in required else _omitted(key)))
                     continue
                 values = f"{'by name, ' if at.endswith('.NAME') else ''}as `{shown[content]}`"
             default = key.get("default")
-            word = default if isinstance(default, str) else json.dumps(default, separators=(",", ":"))
+            word = (
+                default if isinstance(default, str) else json.dumps(default, separators=(",", ":"))
+            )
             set_to = name if name in required else f"{name}={word}"
             meaning = f"{key['description']} ({values})" if "description" in key else values
             lines.append(f"- `{set_to}`: {meaning}")
@@ -124,7 +139,11 @@ def _values(node: Schema, schema: Schema) -> str:
     """Describes the values of a key briefly, as in ">0 [m]"."""
     choices = [option for option in options(schema, node) if option.get("type") != "null"]
     unit = f" [{node['unit']}]" if "unit" in node else ""
-    null = ", null" if len(choices) < len(options(schema, node)) and node.get("default") is not None else ""
+    null = (
+        ", null"
+        if len(choices) < len(options(schema, node)) and node.get("default") is not None
+        else ""
+    )
     return " or ".join(dict.fromkeys(_type(option, schema) for option in choices)) + unit + null
 
 
@@ -138,7 +157,11 @@ def _type(node: Schema, schema: Schema) -> str:
     if kind == "array":
         first = node.get("prefixItems", [node.get("items", {})])[0]
         members = _values(first, schema)
-        members = re.sub(r"^(number|integer|word|group|list)\b", r"\1s", re.sub(r"^(\d)", r"lists of \1", members))
+        members = re.sub(
+            r"^(number|integer|word|group|list)\b",
+            r"\1s",
+            re.sub(r"^(\d)", r"lists of \1", members),
+        )
         members = f"numbers {members}" if members[0] in "<>≤≥" else members
         if node.get("minItems") != node.get("maxItems", 0):
             return f"list of {members}"
@@ -150,4 +173,6 @@ def _type(node: Schema, schema: Schema) -> str:
 
 
 if __name__ == "__main__":
-    Path(__file__).parents[1].joinpath("settings.md").write_text(f"{page().rstrip()}\n", encoding="utf-8")
+    Path(__file__).parents[1].joinpath("settings.md").write_text(
+        f"{page().rstrip()}\n", encoding="utf-8"
+    )

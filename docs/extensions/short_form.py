@@ -1,6 +1,8 @@
-"""Tutorials in their short form, for a book that is only checked: fewer steps or cases, and coarser meshes.
+"""Tutorials in their short form, for a book that is only checked:
+fewer steps or cases, and coarser meshes.
 
-A line of a tutorial that ends in `# short: THIS -> THAT` has THAT in place of THIS in the short form.
+A line of a tutorial that ends in `# short: THIS -> THAT` has THAT in place of THIS in the short
+form.
 """
 
 import re
@@ -11,7 +13,9 @@ _LINE = re.compile(r"^(.*\S) +# short: (.*) -> (.*)$", re.MULTILINE)
 def _shortened(match: re.Match[str]) -> str:
     line, this, that = match.groups()
     if line.count(this) != 1:
-        raise ValueError(f"{this!r}, to be replaced once, is {line.count(this)} times in the line {line!r}")
+        raise ValueError(
+            f"{this!r}, to be replaced once, is {line.count(this)} times in the line {line!r}"
+        )
     return line.replace(this, that)
 
 

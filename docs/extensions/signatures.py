@@ -1,7 +1,8 @@
 """Readable signatures in the API reference.
 
-Type aliases keep their short names, factories of default values are written as calls, and the comments beside the
-fields of a dataclass describe its parameters. In every module, the public names of the package come first.
+Type aliases keep their short names, factories of default values are written as calls, and the
+comments beside the fields of a dataclass describe its parameters. In every module, the public names
+of the package come first.
 """
 
 import ast
@@ -19,9 +20,9 @@ from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.typing import stringify_annotation
 
 _DTYPES = (Any, np.float64, np.float32, np.int64, np.int32, np.uint8, np.bool_, np.complex128)
-_ALIASES = {NDArray[dtype]: f"NDArray[{getattr(dtype, '__name__', dtype)}]" for dtype in _DTYPES} | {
-    ArrayLike: "ArrayLike"
-}
+_ALIASES = {
+    NDArray[dtype]: f"NDArray[{getattr(dtype, '__name__', dtype)}]" for dtype in _DTYPES
+} | {ArrayLike: "ArrayLike"}
 _SHORT = {
     stringify_annotation(alias, mode): short
     for alias, short in _ALIASES.items()
@@ -39,8 +40,13 @@ def shorten(text: str) -> str:
     return _FUNCTION.sub("...", _QUALIFIED.sub("", _PRIVATE.sub(".", text)))
 
 
-def readable(_app: Sphinx, what: str, _name: str, described: Any, _options: Any, parameters: Any, result: Any) -> Any:
-    """Returns the parameters and the result of a signature, shortened; default factories become calls."""
+def readable(
+    _app: Sphinx, what: str, _name: str, described: Any, _options: Any, parameters: Any, result: Any
+) -> Any:
+    """Returns the parameters and the result of a signature, shortened.
+
+    Default factories become calls.
+    """
     if parameters is None:
         return None
     if what == "class" and parameters == "(*args, **kwargs)":  # of a protocol
@@ -49,28 +55,49 @@ def readable(_app: Sphinx, what: str, _name: str, described: Any, _options: Any,
         for field in dataclasses.fields(described):
             if field.init and field.default_factory is not dataclasses.MISSING:
                 factory = getattr(field.default_factory, "__name__", "<lambda>")
-                call = {"dict": "{}", "list": "[]", "tuple": "()", "<lambda>": "..."}.get(factory, f"{factory}()")
+                call = {"dict": "{}", "list": "[]", "tuple": "()", "<lambda>": "..."}.get(
+                    factory, f"{factory}()"
+                )
                 parameters = parameters.replace("<factory>", call, 1)
     return shorten(parameters), result and shorten(result)
 
 
-def describe_fields(_app: Sphinx, what: str, _name: str, described: Any, _options: Any, lines: list[str]) -> None:
-    """Adds the comments beside the fields of a class to its docstring, as descriptions of its parameters."""
-    if what != "class" or not (dataclasses.is_dataclass(described) or hasattr(described, "_fields")):
+def describe_fields(
+    _app: Sphinx, what: str, _name: str, described: Any, _options: Any, lines: list[str]
+) -> None:
+    """Adds the comments beside the fields of a class to its docstring,
+    as descriptions of its parameters.
+    """
+    if what != "class" or not (
+        dataclasses.is_dataclass(described) or hasattr(described, "_fields")
+    ):
         return
-    named = set(re.findall(r":(?:param|ivar|vartype|attr)\s+(\w+):|\.\. attribute:: (\w+)", "\n".join(lines)))
+    named = set(
+        re.findall(
+            r":(?:param|ivar|vartype|attr)\s+(\w+):|\.\. attribute:: (\w+)", "\n".join(lines)
+        )
+    )
     known = {name for names in named for name in names}
     comments = field_comments(inspect.getsource(described))
-    lines += ["", *(f":param {name}: {text}" for name, text in comments.items() if name not in known)]
+    lines += [
+        "",
+        *(f":param {name}: {text}" for name, text in comments.items() if name not in known),
+    ]
 
 
 def field_comments(source: str) -> dict[str, str]:
-    """Returns the comments of the fields of a class by name: those beside them, or directly above."""
+    """Returns the comments of the fields of a class by name:
+    those beside them, or directly above.
+    """
     source = inspect.cleandoc("\n" + source)
     lines = source.splitlines()
     comments = {}
     for field in ast.parse(source).body[0].body:  # type: ignore[attr-defined]
-        if not isinstance(field, ast.AnnAssign) or not isinstance(field.target, ast.Name) or field.end_lineno is None:
+        if (
+            not isinstance(field, ast.AnnAssign)
+            or not isinstance(field.target, ast.Name)
+            or field.end_lineno is None
+        ):
             continue
         beside = lines[field.end_lineno - 1].encode()[field.end_col_offset :].decode().strip()
         above: list[str] = []
@@ -78,7 +105,9 @@ def field_comments(source: str) -> dict[str, str]:
             if not line.strip().startswith("#"):
                 break
             above.insert(0, line.strip().removeprefix("#").strip())
-        text = " ".join([*above, beside.removeprefix("#").strip()] if beside.startswith("#") else above).strip()
+        text = " ".join(
+            [*above, beside.removeprefix("#").strip()] if beside.startswith("#") else above
+        ).strip()
         if text and not field.target.id.startswith("_"):
             comments[field.target.id] = re.sub(r"_(?!\w)", r"\_", text) if "`" not in text else text
     return comments
@@ -88,7 +117,11 @@ def hide_numbered_fields(
     _app: Sphinx, _what: str, _name: str, described: Any, skip: bool, _options: Any
 ) -> bool | None:
     """Leaves out the fields of named tuples: the signature and the parameters have them."""
-    return True if str(getattr(described, "__doc__", "")).startswith("Alias for field number") else None
+    return (
+        True
+        if str(getattr(described, "__doc__", "")).startswith("Alias for field number")
+        else None
+    )
 
 
 def public_first(app: Sphinx) -> None:
@@ -112,7 +145,9 @@ class ShortProperty(PyProperty):
 
 
 class ShortAttribute(PyAttribute):
-    """An attribute whose type is shortened, without values that are no literals, such as modules."""
+    """An attribute whose type is shortened, without values
+    that are no literals, such as modules.
+    """
 
     def handle_signature(self, sig: str, signode: Any) -> tuple[str, str]:
         if self.options.get("value", "").startswith("<"):

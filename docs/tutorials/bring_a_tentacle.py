@@ -8,14 +8,16 @@
 # %% [markdown]
 # # Bring your robot: a tentacle
 #
-# A tapered silicone rod hangs from its base, pulled by two tendons. It was recorded at rest, in one pose after
-# another, with markers without names. The mesh is generated from the rod's dimensions.
-# `experiment=tentacle` is the configuration of a real one. [Your robot](../bring_your_robot.md) explains the steps.
+# A tapered silicone rod hangs from its base, pulled by two tendons. It was recorded at rest, in one
+# pose after another, with markers without names. The mesh is generated from the rod's dimensions.
+# `experiment=tentacle` is the configuration of a real one. [Your robot](../bring_your_robot.md)
+# explains the steps.
 #
 # ## Poses
 #
-# A simulation stands in for the robot. It is stiffer than the data sheet's rod and has a finer mesh, and its first
-# tendon is displaced by a millimetre from the drawing, as is typical of a real robot.
+# A simulation stands in for the robot. It is stiffer than the data sheet's rod and has a finer
+# mesh, and its first tendon is displaced by a millimetre from the drawing, as is typical of a real
+# robot.
 
 # %%
 import json
@@ -46,25 +48,35 @@ tensions = {  # N
     "both_low": [0.4, 0.4], "both_high": [0.9, 0.9], "mixed": [0.5, 1.0],
 }  # fmt: skip
 test = ["first_middle", "second_middle", "mixed"]
-tracked = {"Low": [0.0, 0.016, -0.08], "Middle": [0.0, -0.014, -0.14], "Tip": [0.0, 0.0, -0.208]}  # m, on clips
+tracked = {  # m, on clips
+    "Low": [0.0, 0.016, -0.08],
+    "Middle": [0.0, -0.014, -0.14],
+    "Tip": [0.0, 0.0, -0.208],
+}
 reference = {"Base": [0.03, 0.0, 0.005]}
 
 mesh = rod([[0.0, 0.0, 0.0], [0.0, 0.0, -length]], radii, layers=14)  # short: 14 -> 7
 along = np.linspace(0.0, 1.0, 21)[:, None]
-paths = {name: (1 - along) * np.array(start) + along * np.array(end) for name, (start, end) in routes.items()}
+paths = {
+    name: (1 - along) * np.array(start) + along * np.array(end)
+    for name, (start, end) in routes.items()
+}
 paths["first"] += [0.001, 0.0, 0.0]  # unknown to the simulator
 body = Body(mesh, select_vertices(mesh, z=0.0), energies=[Tendons(paths)])
 laboratory = Simulator(body, StableNeoHookean(310e3, 0.48, density=1120.0))
 pulled = torch.tensor(list(tensions.values()), dtype=torch.float64)  # (B, 2) N
 poses = laboratory.static_equilibrium(Inputs(tendon_tension=pulled), batch=len(pulled)).q
 
-clips = bind_markers(mesh, np.array(list(tracked.values())), list(tracked), kind="patch", patch=0.02)
+clips = bind_markers(
+    mesh, np.array(list(tracked.values())), list(tracked), kind="patch", patch=0.02
+)
 seen = clips(poses).numpy()  # (B, 3, 3) m
 Path("poses").mkdir()
 for name, markers in zip(tensions, seen, strict=True):
     places = np.concatenate([markers, np.array(list(reference.values()))])
     places = places[random.permutation(len(places))]  # in random order
-    frames = np.broadcast_to(places[:, [0, 2, 1]] * [1.0, -1.0, 1.0], (10, len(places), 3))  # y of the cameras is down
+    turned = places[:, [0, 2, 1]] * [1.0, -1.0, 1.0]  # y of the cameras is down
+    frames = np.broadcast_to(turned, (10, len(places), 3))
     frames = frames + 2e-4 * random.standard_normal(frames.shape)
     table = np.column_stack([0.01 * np.arange(10), frames.reshape(10, -1)])
     np.savetxt(f"poses/{name}.csv", table, "%.6f", ",")
@@ -86,13 +98,16 @@ plt.show()
 # ## The configuration
 #
 # - **mesh** is generated from the rod's dimensions.
-# - **table** names the columns of files without a header; markers that are **assigned** by position may have any names.
-#   **axes** gives the orientation of the rod in the frame of the cameras, so that one fixed marker is enough.
-# - The tendons' offsets across the axis, about a millimetre, are **identified** with Young's modulus.
+# - **table** names the columns of files without a header; markers that are **assigned** by position
+#   may have any names. **axes** gives the orientation of the rod in the frame of the cameras, so
+#   that one fixed marker is enough.
+# - The tendons' offsets across the axis, about a millimetre, are **identified** with Young's
+#   modulus.
 # - **placement**: the positions of the clips are known to two millimetres.
 
 # %%
 Path("configs/experiment").mkdir(parents=True)
+trials = {name: {"file": f"{name}.csv", "inputs": pull} for name, pull in tensions.items()}
 offset = "{lower: -2.0e-3, upper: 2.0e-3, prior: {mean: 0.0, deviation: 1.0e-3}}"
 Path("configs/experiment/my_tentacle.yaml").write_text(f"""# @package _global_
 defaults:
@@ -111,8 +126,14 @@ tendons:
   commanded: tension
   stiffness: 0.0
   routes:
-    first: {{guides: {routes["first"]}, pieces: 20, offsets: [[[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]}}
-    second: {{guides: {routes["second"]}, pieces: 20, offsets: [[[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]}}
+    first:
+      guides: {routes["first"]}
+      pieces: 20
+      offsets: [[[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]
+    second:
+      guides: {routes["second"]}
+      pieces: 20
+      offsets: [[[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]
 simulation: {{youngs_modulus: 250.0e3, poissons_ratio: 0.45, density: 1070.0}}  # the data sheet
 data:
   folder: poses
@@ -120,7 +141,7 @@ data:
   table: {{columns: ["time [s]", a.x, a.y, a.z, b.x, b.y, b.z, c.x, c.y, c.z, d.x, d.y, d.z]}}
   axes: [x, z, -y]
   input_limit: 2.0  # N
-  trials: {json.dumps({name: {"file": f"{name}.csv", "inputs": pull} for name, pull in tensions.items()})}
+  trials: {json.dumps(trials)}
   train: {json.dumps([name for name in tensions if name not in test])}
   test: {json.dumps(test)}
 markers:
@@ -141,13 +162,15 @@ identify:
 
 def command(*arguments):
     """Runs `warp-resphys` with arguments, and gives what it printed."""
-    line = [sys.executable, "-m", "warp_resphys", *arguments]  # short: ts] -> ts, "parallel.processes=1"]
+    given = [*arguments]  # short: ts] -> ts, "parallel.processes=1"]
+    line = [sys.executable, "-m", "warp_resphys", *given]
     ended = subprocess.run(line, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr[-2000:]
     return ended.stdout
 
 
-print(command("experiment=my_tentacle", "budget=quick", "data.limit=null"))  # short: l" -> l", "reconstruction=none"
+options = ["budget=quick", "data.limit=null"]  # short: l" -> l", "reconstruction=none"
+print(command("experiment=my_tentacle", *options))
 
 # %% [markdown]
 # ## Results
@@ -162,13 +185,15 @@ for name, value in identified["parameters"].items():
     print(f"{name:24s} {value:10.4g}")
 
 # %% [markdown]
-# Six poses of three markers determine the stiffness and the tendons' offsets; that of the first tendon is close to the
-# true millimetre. The remaining error is little more than the noise, so no learned force was kept.
-# `simfree`, a network that replaces the simulator, has larger errors because it contains no physics.
+# Six poses of three markers determine the stiffness and the tendons' offsets; that of the first
+# tendon is close to the true millimetre. The remaining error is little more than the noise, so no
+# learned force was kept. `simfree`, a network that replaces the simulator, has larger errors
+# because it contains no physics.
 #
 # ## Application
 #
-# The identified tentacle, loaded in one line, computes the reachable positions of the tip: thirty-six poses in a batch.
+# The identified tentacle, loaded in one line, computes the reachable positions of the tip:
+# thirty-six poses in a batch.
 
 # %%
 robot = warp_resphys.load(run, model="sysid")
@@ -187,9 +212,13 @@ plt.show()
 # Here the robot is a simulation, so that this prediction can be checked.
 
 # %%
-asked = laboratory.static_equilibrium(Inputs(tendon_tension=torch.tensor(pairs)), batch=len(pairs)).q
+pulled = Inputs(tendon_tension=torch.tensor(pairs))
+asked = laboratory.static_equilibrium(pulled, batch=len(pairs)).q
 off = np.linalg.norm(1e3 * clips(asked)[:, -1].numpy() - tips, axis=1)
-print(f"the tip is {off.mean():.2f} mm off on average over {np.ptp(tips[:, 0]):.0f} x {np.ptp(tips[:, 1]):.0f} mm")
+print(
+    f"the tip is {off.mean():.2f} mm off on average over {np.ptp(tips[:, 0]):.0f} x "
+    f"{np.ptp(tips[:, 1]):.0f} mm"
+)
 
 # %%
 assert errors["sysid"]["mean"] < 0.2 * errors["simulation"]["mean"]

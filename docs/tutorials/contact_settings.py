@@ -8,9 +8,9 @@
 # %% [markdown]
 # # Distance, stiffness and slip speed of contact
 #
-# [Contact](../contact.md) has three constants that are not in any data sheet: the distance at which it begins, the
-# stiffness of its barrier, and the speed at which friction is fully developed. This page shows the effects of bad
-# values, and how to choose good ones.
+# [Contact](../contact.md) has three constants that are not in any data sheet: the distance at which
+# it begins, the stiffness of its barrier, and the speed at which friction is fully developed. This
+# page shows the effects of bad values, and how to choose good ones.
 #
 # ## Distance: the gap is a thickness
 
@@ -21,7 +21,16 @@ import torch
 import warp as wp
 from matplotlib.collections import PolyCollection
 
-from warp_resphys import Body, Contact, Corotated, Cylinder, HalfSpace, Simulator, box_hexahedra, select_vertices
+from warp_resphys import (
+    Body,
+    Contact,
+    Corotated,
+    Cylinder,
+    HalfSpace,
+    Simulator,
+    box_hexahedra,
+    select_vertices,
+)
 
 wp.config.log_level = wp.LOG_WARNING
 silicone = Corotated(2e5, 0.45, density=1070.0, stiffness_damping=0.02)
@@ -34,15 +43,18 @@ def beam_on_bar(bar, divisions=(16, 1, 2), distance=5e-4):
     body = Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=[contact])
     simulator = Simulator(body, silicone, time_step=0.01, integrator="implicit_euler")
     with torch.no_grad():
-        return mesh, simulator.rollout(simulator.rest_state(), 80).q[-1, 0].numpy()  # short: 80 -> 20
+        motion = simulator.rollout(simulator.rest_state(), 80)  # short: 80 -> 20
+    return mesh, motion.q[-1, 0].numpy()
 
 
 def side_view(ax, mesh, q, bar, title):
     """Draws the cells of the front side, and the bar."""
     faces = mesh.cells[:, [0, 1, 5, 4]]  # of bricks, at the smallest y
     front = faces[mesh.vertices[faces][..., 1].max(1) < 1e-9]
-    ax.add_collection(PolyCollection(1e3 * q[front][..., [0, 2]], facecolor="0.85", edgecolor="0.4", linewidth=0.6))
-    ax.add_patch(plt.Circle((1e3 * bar.position[0], 1e3 * bar.position[2]), 1e3 * bar.radius, color="tab:orange"))
+    corners = 1e3 * q[front][..., [0, 2]]
+    ax.add_collection(PolyCollection(corners, facecolor="0.85", edgecolor="0.4", linewidth=0.6))
+    centre = (1e3 * bar.position[0], 1e3 * bar.position[2])
+    ax.add_patch(plt.Circle(centre, 1e3 * bar.radius, color="tab:orange"))
     ax.set(xlim=(55, 125), ylim=(-45, 15), aspect="equal", title=title)
     ax.axis("off")
 
@@ -55,29 +67,33 @@ for ax, distance in zip(axes, (5e-4, 6e-3), strict=True):
 figure.tight_layout()
 
 # %% [markdown]
-# On the right, the bar is in effect some millimetres thicker. Choose a hundredth to a tenth of the smallest length that
-# matters.
+# On the right, the bar is in effect some millimetres thicker. Choose a hundredth to a tenth of the
+# smallest length that matters.
 #
 # ## Only vertices touch obstacles
 #
-# A thin bar between two vertices sinks into the body, by up to s² / 8 R for a spacing s and a radius R, or through it:
+# A thin bar between two vertices sinks into the body, by up to s² / 8 R for a spacing s and a
+# radius R, or through it:
 
 # %%
 thin = Cylinder(position=(0.0865, 0.01, -0.02), axis=(0.0, 1.0, 0.0), radius=0.0015, length=0.06)
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.6))
-for ax, divisions in zip(axes, ((8, 1, 2), (48, 1, 2)), strict=True):  # short: (48, 1, 2) -> (16, 1, 2)
+meshes = ((8, 1, 2), (48, 1, 2))  # short: (48, 1, 2) -> (16, 1, 2)
+for ax, divisions in zip(axes, meshes, strict=True):
     mesh, q = beam_on_bar(thin, divisions)
     side_view(ax, mesh, q, thin, f"vertices every {120 / divisions[0]:g} mm")
 figure.tight_layout()
 
 # %% [markdown]
-# Refine the mesh along the body until the spacing of its vertices is less than the width of the obstacle, or make the
-# obstacle a body of its own: contact of [surfaces](../contact.md#bodies-and-themselves) includes edges and triangles.
+# Refine the mesh along the body until the spacing of its vertices is less than the width of the
+# obstacle, or make the obstacle a body of its own: contact of
+# [surfaces](../contact.md#bodies-and-themselves) includes edges and triangles.
 #
 # ## Stiffness: the remaining gap
 #
-# A block of 20 mm rests on a floor under increasing load. The remaining gap follows from the ratio of pressure to
-# stiffness: a soft barrier yields like a layer of the body, and a stiff one makes impacts sudden.
+# A block of 20 mm rests on a floor under increasing load. The remaining gap follows from the ratio
+# of pressure to stiffness: a soft barrier yields like a layer of the body, and a stiff one makes
+# impacts sudden.
 
 # %%
 cube = box_hexahedra((0.02, 0.02, 0.02), (2, 2, 2))  # short: (2, 2, 2) -> (1, 1, 1)
@@ -88,8 +104,12 @@ figure, ax = plt.subplots(figsize=(5.5, 3.4))
 for stiffness in (1e4, 1e5, 1e6):  # short: 1e5, 1e6 -> 1e6
     gaps = []
     for load in loads:
-        floor = Contact({"floor": HalfSpace(position=(0.0, 0.0, -0.9 * D))}, stiffness=stiffness, distance=D)
-        simulator = Simulator(Body(cube, energies=[floor]), block, time_step=0.01, gravity=(0.0, 0.0, -9.81 * load))
+        floor = Contact(
+            {"floor": HalfSpace(position=(0.0, 0.0, -0.9 * D))}, stiffness=stiffness, distance=D
+        )
+        simulator = Simulator(
+            Body(cube, energies=[floor]), block, time_step=0.01, gravity=(0.0, 0.0, -9.81 * load)
+        )
         with torch.no_grad():
             end = simulator.rollout(simulator.rest_state(), 60).q[-1, 0, :, 2]
         gaps.append(float(end.min()) + 0.9 * D)
@@ -101,13 +121,15 @@ ax.legend()
 figure.tight_layout()
 
 # %% [markdown]
-# The block never passes through the floor, whatever the stiffness. Begin with Young's modulus of the body.
+# The block never passes through the floor, whatever the stiffness. Begin with Young's modulus of
+# the body.
 #
 # ## Slip speed: sticking bodies creep
 #
-# A block lies on a slope of 15 degrees, with a coefficient of friction of 0.4 that should hold it. Below the slip
-# speed, friction grows with the sliding speed, so that the block creeps at a fraction of the slip speed. A smaller slip
-# speed costs some iterations where bodies begin to slide.
+# A block lies on a slope of 15 degrees, with a coefficient of friction of 0.4 that should hold it.
+# Below the slip speed, friction grows with the sliding speed, so that the block creeps at a
+# fraction of the slip speed. A smaller slip speed costs some iterations where bodies begin to
+# slide.
 
 # %%
 a, creeps = np.radians(15.0), []
@@ -128,5 +150,5 @@ for slip_speed in slip_speeds:
 assert np.allclose(creeps, slip_speeds * (1.0 - np.sqrt(1.0 - np.tan(a) / 0.4)), rtol=0.02)
 
 # %% [markdown]
-# Choose a few per cent of the speeds at which bodies slide, and check that sticking bodies do not creep too far during
-# a trial.
+# Choose a few per cent of the speeds at which bodies slide, and check that sticking bodies do not
+# creep too far during a trial.

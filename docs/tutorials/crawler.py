@@ -8,10 +8,10 @@
 # %% [markdown]
 # # A crawler, and a gait by gradients
 #
-# A soft slab with three muscles along its lower side crawls by friction: it arches, so that one end presses harder on
-# the floor than the other, and the other end slides. Gradients pass through contact and friction
-# ([the equations](../theory.md#contact)), also where vertices stick, slide and lift off. They lead to a gait that is
-# faster than all waves of a grid.
+# A soft slab with three muscles along its lower side crawls by friction: it arches, so that one end
+# presses harder on the floor than the other, and the other end slides. Gradients pass through
+# contact and friction ([the equations](../theory.md#contact)), also where vertices stick, slide and
+# lift off. They lead to a gait that is faster than all waves of a grid.
 #
 # ## The body and the floor
 
@@ -23,7 +23,17 @@ import numpy as np
 import torch
 import warp as wp
 
-from warp_resphys import Body, Contact, Corotated, HalfSpace, Inputs, Mesh, Muscles, Simulator, box_hexahedra
+from warp_resphys import (
+    Body,
+    Contact,
+    Corotated,
+    HalfSpace,
+    Inputs,
+    Mesh,
+    Muscles,
+    Simulator,
+    box_hexahedra,
+)
 from warp_resphys.energies import Muscle
 
 wp.config.log_level = wp.LOG_WARNING
@@ -41,19 +51,27 @@ muscles = [
 ]
 floor = Contact({"floor": HalfSpace()}, friction=0.6, stiffness=2e4, distance=1e-3, slip_speed=5e-3)
 silicone = Corotated(6e4, 0.45, density=1070.0, stiffness_damping=4e-3)
-simulator = Simulator(Body(mesh, energies=[Muscles(muscles), floor]), silicone, time_step=0.01, relative_tolerance=1e-6)
+simulator = Simulator(
+    Body(mesh, energies=[Muscles(muscles), floor]),
+    silicone,
+    time_step=0.01,
+    relative_tolerance=1e-6,
+)
 
 # %% [markdown]
 # ## Gaits
 #
-# A gait is a periodic stress of every muscle, between 0 and 10 kPa, with a period of half a second: a constant and two
-# harmonics, through a sigmoid. Three periods are simulated; the stress is ramped up in the first one.
+# A gait is a periodic stress of every muscle, between 0 and 10 kPa, with a period of half a second:
+# a constant and two harmonics, through a sigmoid. Three periods are simulated; the stress is ramped
+# up in the first one.
 
 # %%
 PERIOD, STEPS, MOST = 0.5, 150, 1e4  # s, steps, Pa
 times = simulator.time_step * (1.0 + torch.arange(STEPS, dtype=torch.float64))
 turns = 2.0 * math.pi * times / PERIOD
-harmonics = torch.stack([torch.ones_like(turns), *(f(k * turns) for k in (1, 2) for f in (torch.cos, torch.sin))])
+harmonics = torch.stack(
+    [torch.ones_like(turns), *(f(k * turns) for k in (1, 2) for f in (torch.cos, torch.sin))]
+)
 ramp = (times / PERIOD).clamp_max(1.0)[:, None, None]
 
 
@@ -71,7 +89,9 @@ def crawl(gaits):
 
 
 def waves(phases):
-    """Gaits (B, 3, 5) that switch the muscles on and off, the middle and the front one with phases (B, 2) [rad]."""
+    """Gaits (B, 3, 5) that switch the muscles on and off, the middle and the front one with phases
+    (B, 2) [rad].
+    """
     phases = torch.nn.functional.pad(phases, (1, 0))
     gaits = torch.zeros(len(phases), 3, 5, dtype=torch.float64)
     gaits[..., 1], gaits[..., 2] = 3.0 * torch.cos(phases), 3.0 * torch.sin(phases)
@@ -92,14 +112,15 @@ with torch.no_grad():
 best = int(ways.argmax())
 middle_phase, front_phase = grid[best].tolist()
 print(
-    f"best of 36 waves: {1e3 * ways[best]:.1f} mm in 1.5 s, with phases of {middle_phase:.2f} and {front_phase:.2f} rad"
+    f"best of 36 waves: {1e3 * ways[best]:.1f} mm in 1.5 s, with phases of {middle_phase:.2f} "
+    f"and {front_phase:.2f} rad"
 )
 
 # %% [markdown]
 # ## A gait by gradients
 #
-# The same effort of 36 simulations, where one with its gradient counts as two: eight random waves, then fourteen steps
-# of Adam from the best of them.
+# The same effort of 36 simulations, where one with its gradient counts as two: eight random waves,
+# then fourteen steps of Adam from the best of them.
 
 # %%
 torch.manual_seed(0)
@@ -126,7 +147,10 @@ left.plot(8 + 2 * np.arange(1, 1 + len(reached)), reached, "o-", label="gradient
 left.set(xlabel="simulations", ylabel="way [mm]", ylim=(0, None))
 left.legend(frameon=False)
 clock = simulator.time_step * np.arange(STEPS + 1)
-for label, q in (("best of 36 waves", motions.q[:, best]), ("gradients", motion.q[:, 0].detach() * direction)):
+for label, q in (
+    ("best of 36 waves", motions.q[:, best]),
+    ("gradients", motion.q[:, 0].detach() * direction),
+):
     right.plot(clock, 1e3 * (q[..., 0].mean(-1) - q[0, :, 0].mean()), label=label)
 right.set(xlabel="time [s]", ylabel="place of the middle [mm]")
 right.legend(frameon=False)
@@ -153,8 +177,9 @@ plt.show()
 # %% [markdown]
 # ## Friction over a period
 #
-# `Simulator.contacts` returns gaps, normal forces, friction and the slide of every vertex in a step; they are
-# differentiable too. The figure shows the friction of both halves of the slab over the last period:
+# `Simulator.contacts` returns gaps, normal forces, friction and the slide of every vertex in a
+# step; they are differentiable too. The figure shows the friction of both halves of the slab over
+# the last period:
 
 # %%
 forces = []
@@ -167,7 +192,9 @@ with torch.no_grad():
         contact = simulator.contacts(state, after, inputs)["obstacles"]
         if front is None:
             front = torch.as_tensor(mesh.vertices[contact.vertices, 0] > LENGTH / 2)
-        forces.append([float(contact.friction[0, chosen, 0, 0].sum()) for chosen in (~front, front)])
+        forces.append(
+            [float(contact.friction[0, chosen, 0, 0].sum()) for chosen in (~front, front)]
+        )
         state = after
 forces = 1e3 * np.array(forces)
 figure, axis = plt.subplots(figsize=(7, 3), layout="constrained")
@@ -178,8 +205,8 @@ axis.legend(frameon=False)
 plt.show()
 
 # %% [markdown]
-# One half sticks while the other slides; over a period the sum is about zero. The weight of the slab is
-# 0.6 N, so friction can be at most 0.36 N.
+# One half sticks while the other slides; over a period the sum is about zero. The weight of the
+# slab is 0.6 N, so friction can be at most 0.36 N.
 
 # %%
 assert reached[-1] > 1.5e3 * ways[best]  # short: 1.5e3 * ways[best] -> reached[0]

@@ -8,27 +8,29 @@
 # %% [markdown]
 # # Write your own energy
 #
-# Materials, pressure, fibres, tendons, muscles and water are energies. A new energy is a Warp function and a class of a
-# few lines; solver, adjoint, tape and identification support it without changes. This
-# page implements a floor, on which a block falls, and an elastic string. (For real use, the package has
-# [contact](../contact.md) with friction.)
+# Materials, pressure, fibres, tendons, muscles and water are energies. A new energy is a Warp
+# function and a class of a few lines; solver, adjoint, tape and identification support it without
+# changes. This page implements a floor, on which a block falls, and an elastic string. (For real
+# use, the package has [contact](../contact.md) with friction.)
 #
 # ## The equation
 #
 # A vertex that is $d = z_0 - z > 0$ below the floor's height $z_0$ has the energy
 #
-# $$ e = \tfrac{k}{3} d^3, \qquad \text{a force } k d^2 \text{ upwards}, \qquad \text{a stiffness } 2 k d, $$
+# $$ e = \tfrac{k}{3} d^3, \qquad \text{a force } k d^2 \text{ upwards}, \qquad
+# \text{a stiffness } 2 k d, $$
 #
-# which is twice continuously differentiable where contact begins, as Newton's method and gradients require. Its
-# parameters are $k$ [N/m²] and $z_0$ [m].
+# which is twice continuously differentiable where contact begins, as Newton's method and gradients
+# require. Its parameters are $k$ [N/m²] and $z_0$ [m].
 #
 # ## The function and the class
 #
-# An energy is a sum over points. Its argument is a weighted sum of a few vertices: the position of a vertex, the vector
-# from one to another, or, as a matrix, the deformation gradient in a cell. The energy of a point is a Warp function of
-# this argument and of the point's values. These are the parameters and inputs in the order in which the class declares
-# them, with units and ranges, which are checked. Warp differentiates the function for the forces. The second
-# derivatives, for Newton steps and gradients, are fourth-order differences of the forces, exact to about nine digits.
+# An energy is a sum over points. Its argument is a weighted sum of a few vertices: the position of
+# a vertex, the vector from one to another, or, as a matrix, the deformation gradient in a cell. The
+# energy of a point is a Warp function of this argument and of the point's values. These are the
+# parameters and inputs in the order in which the class declares them, with units and ranges, which
+# are checked. Warp differentiates the function for the forces. The second derivatives, for Newton
+# steps and gradients, are fourth-order differences of the forces, exact to about nine digits.
 
 # %%
 from dataclasses import dataclass
@@ -70,11 +72,22 @@ class Floor(PointwiseEnergy):
 # ## A block that is dropped
 
 # %%
-mesh = box_hexahedra(size=(0.04, 0.04, 0.04), divisions=(4, 4, 4))  # m  # short: (4, 4, 4) -> (2, 2, 2)
+mesh = box_hexahedra(
+    size=(0.04, 0.04, 0.04),  # m
+    divisions=(4, 4, 4),  # short: (4, 4, 4) -> (2, 2, 2)
+)
 bottom, top = select_vertices(mesh, z=0.0), select_vertices(mesh, z=0.04)
 body = Body(mesh, energies=[Floor(bottom, stiffness=1e5, height=-0.02)])
-silicone = Corotated(youngs_modulus=50e3, poissons_ratio=0.45, density=1070.0, stiffness_damping=2e-3)
-simulator = Simulator(body, silicone, time_step=0.002, integrator="bdf2", relative_tolerance=1e-9)  # short: 02, -> 04,
+silicone = Corotated(
+    youngs_modulus=50e3, poissons_ratio=0.45, density=1070.0, stiffness_damping=2e-3
+)
+simulator = Simulator(
+    body,
+    silicone,
+    time_step=0.002,  # short: 02, -> 04,
+    integrator="bdf2",
+    relative_tolerance=1e-9,
+)
 print("parameters:", ", ".join(simulator.parameters))
 
 fall = simulator.rollout(simulator.rest_state(), steps=1000)  # short: 1000 -> 500
@@ -99,17 +112,19 @@ print(f"carried {carried:.4f} N, weight {weight:.4f} N")
 # %% [markdown]
 # ## Its gradients
 #
-# The derivatives of the block's height after the first rebound, with respect to both parameters of the floor, are
-# compared with central differences. Every new energy should have this test.
+# The derivatives of the block's height after the first rebound, with respect to both parameters of
+# the floor, are compared with central differences. Every new energy should have this test.
 
 # %%
 state = simulator.rest_state()
-state = State(state.q - torch.tensor([0.0, 0.0, 0.018], dtype=torch.float64), state.v)  # it falls 2 mm
+down = torch.tensor([0.0, 0.0, 0.018], dtype=torch.float64)
+state = State(state.q - down, state.v)  # it falls 2 mm
 
 
 def rebound(stiffness, floor):
     parameters = {"floor_stiffness": stiffness, "floor_height": floor}
-    return simulator.rollout(state, steps=60, parameters=parameters).q[-1, 0, :, 2].mean()  # short: 60 -> 30
+    fall = simulator.rollout(state, steps=60, parameters=parameters)  # short: 60 -> 30
+    return fall.q[-1, 0, :, 2].mean()
 
 
 values = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in (1e5, -0.02)]
@@ -117,18 +132,21 @@ rebound(*values).backward()
 worst = 0.0
 for number, step in enumerate((1.0, 1e-7)):
     with torch.no_grad():
-        moved = [[v + sign * step * (k == number) for k, v in enumerate(values)] for sign in (1.0, -1.0)]
+        moved = [
+            [v + sign * step * (k == number) for k, v in enumerate(values)] for sign in (1.0, -1.0)
+        ]
         difference = (rebound(*moved[0]) - rebound(*moved[1])).item() / (2.0 * step)
     adjoint = values[number].grad.item()
     worst = max(worst, abs(adjoint / difference - 1.0))
-    print(f"{list(simulator.parameters)[-3:-1][number]}: adjoint {adjoint:.9e}, differences {difference:.9e}")
+    name = list(simulator.parameters)[-3:-1][number]
+    print(f"{name}: adjoint {adjoint:.9e}, differences {difference:.9e}")
 
 # %% [markdown]
 # ## An elastic string
 #
-# The argument of this energy is the vector from one vertex to another: a spring along a diagonal of the block. With
-# stiffness $k$ and length $L$ it has the energy $\tfrac{k}{2} (|x| - L)^2$. With `per`, every spring has its own
-# values.
+# The argument of this energy is the vector from one vertex to another: a spring along a diagonal of
+# the block. With stiffness $k$ and length $L$ it has the energy $\tfrac{k}{2} (|x| - L)^2$. With
+# `per`, every spring has its own values.
 
 
 # %%
@@ -165,8 +183,9 @@ print(f"the spring is {1e3 * length:.2f} mm long and pulls with {20.0 * (length 
 # %% [markdown]
 # ## Use in an experiment
 #
-# [Your own physics](../extending.md) shows how a package of yours gives this energy a name in configurations, so that
-# its parameters can be identified by name. For speed, kernels can be written by hand, as for pressure.
+# [Your own physics](../extending.md) shows how a package of yours gives this energy a name in
+# configurations, so that its parameters can be identified by name. For speed, kernels can be
+# written by hand, as for pressure.
 
 # %%
 assert abs(carried / weight - 1) < 1e-3

@@ -8,9 +8,9 @@
 # %% [markdown]
 # # Gradients and identification
 #
-# Every time step is differentiable with respect to forces, states, materials and actuators, through any number of
-# steps. This page computes such a gradient, checks it against finite differences, and uses it to identify Young's
-# modulus and a viscosity from noisy markers.
+# Every time step is differentiable with respect to forces, states, materials and actuators, through
+# any number of steps. This page computes such a gradient, checks it against finite differences, and
+# uses it to identify Young's modulus and a viscosity from noisy markers.
 
 # %%
 import matplotlib.pyplot as plt
@@ -19,15 +19,27 @@ import scipy.optimize
 import torch
 import warp as wp
 
-from warp_resphys import Body, Corotated, Inputs, Simulator, box_hexahedra, record_rollout, select_vertices
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Simulator,
+    box_hexahedra,
+    record_rollout,
+    select_vertices,
+)
 
 wp.config.log_level = wp.LOG_WARNING
 torch.manual_seed(0)
 
-mesh = box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(10, 3, 3))  # m  # short: (10, 3, 3) -> (4, 1, 1)
+mesh = box_hexahedra(
+    size=(0.1, 0.03, 0.03),  # m
+    divisions=(10, 3, 3),  # short: (10, 3, 3) -> (4, 1, 1)
+)
 body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
 tip = select_vertices(mesh, x=0.1)
-# Second order, with residuals far below the measured differences; gradients are exact at the solution.
+# Second order, with residuals far below the measured differences; gradients are exact at the
+# solution.
 simulator = Simulator(
     body,
     Corotated(youngs_modulus=264e3, poissons_ratio=0.499, density=1070.0),
@@ -63,15 +75,18 @@ print(f"d(height at the end) / dE = {exact:.9e} m/Pa")
 # %% [markdown]
 # ## Check
 #
-# The error of central differences decreases with the square of the step, until rounding dominates. If the gradient
-# were wrong, the error would stop decreasing earlier, at the error of the gradient.
+# The error of central differences decreases with the square of the step, until rounding dominates.
+# If the gradient were wrong, the error would stop decreasing earlier, at the error of the gradient.
 
 # %%
-relative = 10.0 ** -np.arange(1.0, 7.5, 0.5)  # short: np.arange(1.0, 7.5, 0.5) -> np.array([2.0, 4.0, 5.0])
+digits = np.arange(1.0, 7.5, 0.5)  # short: np.arange(1.0, 7.5, 0.5) -> np.array([2.0, 4.0, 5.0])
+relative = 10.0**-digits
 errors = []
 with torch.no_grad():
     for step in relative:
-        up, down = (heights(torch.tensor([264e3 * (1 + sign * step)]))[-1].item() for sign in (1, -1))
+        up, down = (
+            heights(torch.tensor([264e3 * (1 + sign * step)]))[-1].item() for sign in (1, -1)
+        )
         errors.append(abs((up - down) / (2 * 264e3 * step) / exact - 1))
 figure, axis = plt.subplots(figsize=(5, 3), layout="constrained")
 axis.loglog(relative, errors, "o-")
@@ -80,14 +95,14 @@ plt.show()
 print(f"smallest: {min(errors):.1e}")
 
 # %% [markdown]
-# The backward pass is the discrete adjoint of the implicit step: one linear solve with the Hessian at the solution,
-# independent of the iterations. Its cost is about that of one step.
+# The backward pass is the discrete adjoint of the implicit step: one linear solve with the Hessian
+# at the solution, independent of the iterations. Its cost is about that of one step.
 #
 # ## Identification
 #
-# Now a noisy motion is given, as for a robot. Its material is stiffer than the data sheet's, and viscous.
-# One backward pass computes the gradient of the squared error with respect to both parameters, at a cost that does not
-# depend on their number. L-BFGS minimises the error.
+# Now a noisy motion is given, as for a robot. Its material is stiffer than the data sheet's, and
+# viscous. One backward pass computes the gradient of the squared error with respect to both
+# parameters, at a cost that does not depend on their number. L-BFGS minimises the error.
 
 # %%
 truth = {"modulus": 300e3, "viscosity": 4e-3}  # Pa, s
@@ -97,7 +112,7 @@ measured = clean + 1e-4 * torch.randn(STEPS + 1, dtype=torch.float64)  # 0.1 mm 
 
 
 def loss(x):
-    """Mean squared error [noise^2] and its gradient by the logarithms of the parameters relative to initial guesses."""
+    """Mean squared error [noise^2] and its gradient by logarithms of both over first guesses."""
     logarithms = torch.tensor(x, requires_grad=True)
     guess = torch.tensor([264e3, 1e-3], dtype=torch.float64) * logarithms.exp()
     error = ((heights(guess[:1], guess[1:]) - measured) / 1e-4).square().mean()
@@ -107,14 +122,20 @@ def loss(x):
 
 
 history = []
-fit = scipy.optimize.minimize(loss, np.zeros(2), jac=True, method="L-BFGS-B", bounds=[(-1.0, 1.0), (-4.0, 4.0)])
+fit = scipy.optimize.minimize(
+    loss, np.zeros(2), jac=True, method="L-BFGS-B", bounds=[(-1.0, 1.0), (-4.0, 4.0)]
+)
 modulus, viscosity = 264e3 * np.exp(fit.x[0]), 1e-3 * np.exp(fit.x[1])
-print(f"E = {modulus / 1e3:.2f} kPa (true: 300), viscosity {1e3 * viscosity:.2f} ms (true: 4.00), {fit.nfev} roll-outs")
+print(
+    f"E = {modulus / 1e3:.2f} kPa (true: 300), viscosity {1e3 * viscosity:.2f} ms (true: 4.00), "
+    f"{fit.nfev} roll-outs"
+)
 print(f"remaining error: {fit.fun**0.5:.2f} of the noise")
 
 # %%
 with torch.no_grad():
-    before, after = heights(torch.tensor([264e3])), heights(torch.tensor([modulus]), torch.tensor([viscosity]))
+    before = heights(torch.tensor([264e3]))
+    after = heights(torch.tensor([modulus]), torch.tensor([viscosity]))
 times = simulator.time_step * np.arange(STEPS + 1)
 figure, axis = plt.subplots(figsize=(7, 3), layout="constrained")
 axis.plot(times, 1e3 * measured, "k.", label="measured")
@@ -125,20 +146,24 @@ figure.legend(loc="outside upper center", ncols=3, frameon=False)
 plt.show()
 
 # %% [markdown]
-# In an experiment the stage `identify` does this, with several starts, priors, uncertain marker positions
-# and a posterior of the parameters ([experiments](../experiments.md)); in Python, use `warp_resphys.identify`.
+# In an experiment the stage `identify` does this, with several starts, priors, uncertain marker
+# positions and a posterior of the parameters ([experiments](../experiments.md)); in Python, use
+# `warp_resphys.identify`.
 #
 # ## Gradients on a Warp tape
 #
-# For users of Warp kernels, `wp.Tape` gives the same gradients, in the same memory. Here a kernel computes the final
-# height of the tip, and the gradient is with respect to the initial positions.
+# For users of Warp kernels, `wp.Tape` gives the same gradients, in the same memory. Here a kernel
+# computes the final height of the tip, and the gradient is with respect to the initial positions.
 
 
 # %%
 @wp.kernel
 def mean_height(
-    q: wp.array3d[wp.vec3d], vertices: wp.array[wp.int32], step: wp.int32, result: wp.array[wp.float64]
-):  # the tip's
+    q: wp.array3d[wp.vec3d],
+    vertices: wp.array[wp.int32],  # the tip's
+    step: wp.int32,
+    result: wp.array[wp.float64],
+):
     i = wp.tid()
     wp.atomic_add(result, 0, q[step, 0, vertices[i]][2] / wp.float64(vertices.shape[0]))
 
@@ -157,14 +182,17 @@ state = simulator.rest_state()
 state.q.requires_grad_()
 simulator.rollout(state, 10).q[-1, 0, tip, 2].mean().backward()
 print(
-    "largest gradient:", by_warp.abs().max().item(), "difference of both:", (by_warp - state.q.grad).abs().max().item()
+    "largest gradient:",
+    by_warp.abs().max().item(),
+    "difference of both:",
+    (by_warp - state.q.grad).abs().max().item(),
 )
 
 # %% [markdown]
 # ## Summary
 #
-# Differences agree with the adjoint to one part in ten million, the parameters are identified within the accuracy that
-# the noise allows, and torch and Warp give the same gradient.
+# Differences agree with the adjoint to one part in ten million, the parameters are identified
+# within the accuracy that the noise allows, and torch and Warp give the same gradient.
 
 # %%
 assert min(errors) < 1e-7

@@ -8,9 +8,10 @@
 # %% [markdown]
 # # A gripper, and a grasp by gradients
 #
-# Two soft fingers with tendons grasp a soft ball on a table, lift it, and shake it. The ball touches the table, and the
-# fingers touch the ball ([the equations](../theory.md#contact)). Gradients pass through all contacts. They lead to a
-# variable tension with a smaller mean than the best of ten constant tensions.
+# Two soft fingers with tendons grasp a soft ball on a table, lift it, and shake it. The ball
+# touches the table, and the fingers touch the ball ([the equations](../theory.md#contact)).
+# Gradients pass through all contacts. They lead to a variable tension with a smaller mean than the
+# best of ten constant tensions.
 #
 # ## Fingers, ball and table
 
@@ -49,7 +50,8 @@ def finger(side):
     """A finger that hangs beside the ball, with a tendon 3 mm below its inner face."""
     box = box_hexahedra((SIDE, SIDE, LENGTH), (2, 2, 10))
     inner = RADIUS + GAP
-    mesh = replace(box, vertices=box.vertices - [SIDE / 2, SIDE / 2, LENGTH] + [0.0, side * (inner + SIDE / 2), 0.0])
+    place = [0.0, side * (inner + SIDE / 2), 0.0]
+    mesh = replace(box, vertices=box.vertices - [SIDE / 2, SIDE / 2, LENGTH] + place)
     tendon = Tendons([[[0.0, side * (inner + 0.003), z] for z in np.linspace(0.0, -LENGTH, 11)]])
     return Body(mesh, fixed=select_vertices(mesh, z=0.0), energies=[tendon])
 
@@ -59,18 +61,22 @@ x = cube.vertices - 1.0
 y2, z2 = np.roll(x, 1, axis=1) ** 2, np.roll(x, 2, axis=1) ** 2
 sphere = x * np.sqrt(1.0 - y2 / 2.0 - z2 / 2.0 + y2 * z2 / 3.0)
 sphere = replace(cube, vertices=RADIUS * sphere + [0.0, 0.0, TABLE + RADIUS + 0.9 * D])
-table = Contact({"table": HalfSpace(position=(0.0, 0.0, TABLE))}, 5e4, 0.5, distance=D, slip_speed=5e-3)
+table = Contact(
+    {"table": HalfSpace(position=(0.0, 0.0, TABLE))}, 5e4, 0.5, distance=D, slip_speed=5e-3
+)
 bodies = {"left": finger(-1.0), "right": finger(1.0), "ball": Body(sphere, energies=[table])}
-scene = Scene(bodies, contact=SurfaceContact(stiffness=5e4, friction=0.5, distance=D, slip_speed=5e-3))
+scene = Scene(
+    bodies, contact=SurfaceContact(stiffness=5e4, friction=0.5, distance=D, slip_speed=5e-3)
+)
 rubber = Corotated(2.5e5, 0.45, density=1070.0, stiffness_damping=4e-3)
 simulator = Simulator(scene, rubber, time_step=0.01, relative_tolerance=1e-6)
 
 # %% [markdown]
 # ## The task
 #
-# The fingers close within 0.2 s. Their base rises by 30 mm up to 0.5 s, and from 0.6 s on swings sideways by 8 mm, five
-# times a second. The tension of both tendons is linear between six values. The ball is held if it is
-# 30 mm higher at the end.
+# The fingers close within 0.2 s. Their base rises by 30 mm up to 0.5 s, and from 0.6 s on swings
+# sideways by 8 mm, five times a second. The tension of both tendons is linear between six values.
+# The ball is held if it is 30 mm higher at the end.
 
 # %%
 STEPS = 90
@@ -90,11 +96,12 @@ def tensions(knots):
     place = 5.0 * times / times[-1]
     left = place.floor().long().clamp_max(4)
     share = place - left
-    return ((1.0 - share) * knots[:, left] + share * knots[:, left + 1]).mT[..., None] * closing[:, None, None]
+    between = (1.0 - share) * knots[:, left] + share * knots[:, left + 1]
+    return between.mT[..., None] * closing[:, None, None]
 
 
 def grasp(knots):
-    """Height of the ball (B,) at the end over that at the start [mm], mean tensions (B,) [N], and the trajectory."""
+    """Rise of the ball to the end (B,) [mm], mean tensions (B,) [N], and the trajectory."""
     pull = tensions(knots)
     own = scene.inputs({name: Inputs(tendon_tension=pull) for name in ("left", "right")})
     inputs = Inputs(fixed_positions=base.expand(-1, len(knots), -1, -1), **own.fields)
@@ -119,11 +126,12 @@ least = int(torch.where(heights >= HELD, efforts, torch.inf).argmin())
 # %% [markdown]
 # ## A variable tension by gradients
 #
-# The same effort of ten simulations, where one with its gradient counts as two: five steps of Adam from 1.4 N. The loss
-# is the mean tension plus a penalty on every missing millimetre of height. For a dropped ball, no gradient leads back
-# to the grasp, so the steps are small, and the best tension that holds the ball is kept. Initial value, size and number
-# of steps were tuned on this task: with more steps the ball falls. The constant tension of 1.3 N misses the
-# height by 0.1 mm; its mean would be 1.16 N.
+# The same effort of ten simulations, where one with its gradient counts as two: five steps of Adam
+# from 1.4 N. The loss is the mean tension plus a penalty on every missing millimetre of height. For
+# a dropped ball, no gradient leads back to the grasp, so the steps are small, and the best tension
+# that holds the ball is kept. Initial value, size and number of steps were tuned on this task: with
+# more steps the ball falls. The constant tension of 1.3 N misses the height by 0.1 mm; its mean
+# would be 1.16 N.
 
 # %%
 knots = torch.full((1, 6), 1.4, dtype=torch.float64, requires_grad=True)
@@ -139,7 +147,10 @@ for _ in range(5):  # short: 5 -> 2
         best = (effort.item(), knots.detach().clone(), motion)
     optimiser.step()
 mean, course, motion = best
-print(f"held by {mean:.2f} N on average, and by a constant tension of {efforts[least]:.2f} N on average")
+print(
+    f"held by {mean:.2f} N on average, "
+    f"and by a constant tension of {efforts[least]:.2f} N on average"
+)
 
 # %%
 figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")
@@ -169,10 +180,16 @@ for axis, step in zip(axes, (0, 20, 50, 75), strict=True):
     corners = 1e3 * q[step][faces]
     order = np.argsort(corners[..., 0].mean(1))
     colours = np.where(faces[order, 0] >= ball.start, "C1", "C0")
-    axis.add_collection(PolyCollection(corners[order][..., 1:], facecolors=colours, edgecolors="white", linewidths=0.3))
+    sides = corners[order][..., 1:]
+    shown = PolyCollection(sides, facecolors=colours, edgecolors="white", linewidths=0.3)
+    axis.add_collection(shown)
     axis.axhline(1e3 * TABLE, color="0.4", linewidth=0.8)
     axis.set(
-        title=f"{step * simulator.time_step:.2f} s", xlim=(-42, 42), ylim=(-90, 35), aspect="equal", xlabel="y [mm]"
+        title=f"{step * simulator.time_step:.2f} s",
+        xlim=(-42, 42),
+        ylim=(-90, 35),
+        aspect="equal",
+        xlabel="y [mm]",
     )
 axes[0].set(ylabel="z [mm]")
 plt.show()
@@ -180,9 +197,10 @@ plt.show()
 # %% [markdown]
 # ## Forces on the ball over time
 #
-# `Simulator.contacts` returns gaps, normal forces and friction of every vertex in a step. A finger presses on the ball
-# from the side, and both carry its weight of 75 mN, mostly by friction. As the base rises they lift it, which takes
-# more than its weight and then less; until then, the table carries a part.
+# `Simulator.contacts` returns gaps, normal forces and friction of every vertex in a step. A finger
+# presses on the ball from the side, and both carry its weight of 75 mN, mostly by friction. As the
+# base rises they lift it, which takes more than its weight and then less; until then, the table
+# carries a part.
 
 # %%
 state, shown = simulator.rest_state(), []
@@ -199,7 +217,11 @@ with torch.no_grad():
         shown.append((press, forces.normal[0, on_ball, 2].sum() + friction, friction))
 presses, carried, rubbed = 1e3 * torch.tensor(shown).mT
 figure, axis = plt.subplots(figsize=(6, 3), layout="constrained")
-for label, force in (("pressed by a finger", presses), ("carried by both", carried), ("of that by friction", rubbed)):
+for label, force in (
+    ("pressed by a finger", presses),
+    ("carried by both", carried),
+    ("of that by friction", rubbed),
+):
     axis.plot(times, force, label=label)
 axis.set(xlabel="time [s]", ylabel="force on the ball [mN]")
 axis.legend(frameon=False)

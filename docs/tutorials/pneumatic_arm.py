@@ -8,10 +8,11 @@
 # %% [markdown]
 # # A pneumatic arm
 #
-# A silicone arm with three chambers hangs from its base. Air pressure in a chamber lengthens its side,
-# and the arm bends away. This page generates such an arm from its dimensions, bends it, uses the adjoint to compute the
-# pressures that bring the tip to a target, and opens a valve. [The guide](../actuators.md) adds markers,
-# identification and a learned force (`experiment=sopra`).
+# A silicone arm with three chambers hangs from its base. Air pressure in a chamber lengthens its
+# side, and the arm bends away. This page generates such an arm from its dimensions, bends it, uses
+# the adjoint to compute the pressures that bring the tip to a target, and opens a valve.
+# [The guide](../actuators.md) adds markers, identification and a learned force
+# (`experiment=sopra`).
 #
 # ## The arm
 
@@ -27,14 +28,21 @@ from warp_resphys.mesh import ArmMesh, find_chambers, mesh_arm
 
 wp.config.log_level = wp.LOG_WARNING
 
-dimensions = ArmMesh(chamber_lengths=(0.1,), caps=(0.008, 0.008), radii=(0.022, 0.018), size=0.008)  # m
-mesh, surfaces = mesh_arm(dimensions)  # short: dimensions -> dimensions.model_copy(update={"size": 0.015})
+dimensions = ArmMesh(  # m
+    chamber_lengths=(0.1,),
+    caps=(0.008, 0.008),
+    radii=(0.022, 0.018),
+    size=0.008,  # short: 0.008 -> 0.015
+)
+mesh, surfaces = mesh_arm(dimensions)
 chambers = find_chambers(mesh)
 print(f"{len(mesh.vertices)} vertices; surfaces: {', '.join(surfaces)}")
 
 length = -mesh.vertices[:, 2].min()
 tip = select_vertices(mesh, z=-length)
-silicone = Corotated(youngs_modulus=264e3, poissons_ratio=0.49, density=1070.0, stiffness_damping=5e-3)
+silicone = Corotated(
+    youngs_modulus=264e3, poissons_ratio=0.49, density=1070.0, stiffness_damping=5e-3
+)
 
 
 def arm(energies):
@@ -45,15 +53,19 @@ def arm(energies):
 # %% [markdown]
 # ## Fibres
 #
-# Air pressure acts in all directions. Without a thread around it, a chamber widens more than it lengthens, and bends
-# the arm less. Fibres are an energy of the chamber's surface that resists stretching along the thread.
+# Air pressure acts in all directions. Without a thread around it, a chamber widens more than it
+# lengthens, and bends the arm less. Fibres are an energy of the chamber's surface that resists
+# stretching along the thread.
 
 # %%
 threads = Fibres(chambers, (8.0, -8.0), stiffness=1e4)  # degrees; N/m
 pressures = torch.zeros(6, 3, dtype=torch.float64)  # (B, chambers) Pa  # short: (6 -> (2
 pressures[:, 0] = torch.linspace(0.0, 20e3, 6)  # short: , 6 -> , 2
 volumes, bends = {}, {}
-for name, energies in {"without fibres": [Pressure(chambers)], "with fibres": [Pressure(chambers), threads]}.items():
+for name, energies in {
+    "without fibres": [Pressure(chambers)],
+    "with fibres": [Pressure(chambers), threads],
+}.items():
     simulator = arm(energies)
     states = simulator.static_equilibrium(Inputs(pressure=pressures), batch=len(pressures))
     bends[name] = 1e3 * (states.q[:, tip].mean(1) - states.q[0, tip].mean(0)).norm(dim=1)
@@ -71,8 +83,8 @@ plt.show()
 # %% [markdown]
 # ## Pressures for a target
 #
-# Which pressures bring the tip to a given position? `static_equilibrium` is differentiable, and its adjoint is
-# one linear solve. L-BFGS minimises the distance, with bounds on the pressures.
+# Which pressures bring the tip to a given position? `static_equilibrium` is differentiable, and its
+# adjoint is one linear solve. L-BFGS minimises the distance, with bounds on the pressures.
 
 # %%
 simulator = arm([Pressure(chambers), threads])
@@ -82,7 +94,7 @@ history = []
 
 
 def miss(x):
-    """Squared distance of the tip from the target [mm^2], with a small price on pressure, and its gradient."""
+    """Squared distance of the tip from the target [mm^2], a small price on pressure, gradient."""
     pressure = (1e4 * torch.tensor(x)[None]).requires_grad_()  # (1, 3) Pa
     place = simulator.static_equilibrium(Inputs(pressure=pressure)).q[0, tip].mean(0)
     distance = 1e3 * (place - target)[:2].norm()
@@ -92,15 +104,25 @@ def miss(x):
     return value.item(), 1e4 * pressure.grad[0].numpy()
 
 
-best = scipy.optimize.minimize(miss, np.full(3, 0.3), jac=True, method="L-BFGS-B", bounds=[(0.0, 2.5)] * 3)
+best = scipy.optimize.minimize(
+    miss, np.full(3, 0.3), jac=True, method="L-BFGS-B", bounds=[(0.0, 2.5)] * 3
+)
 pressure = 1e4 * best.x
-print(f"pressures {np.round(1e-3 * pressure, 2)} kPa; the tip is {history[-1]:.3f} mm from the target in the plane")
-print(f"{len(history)} equilibria; distances [mm]:", ", ".join(f"{distance:.2f}" for distance in history[:8]), "...")
+print(
+    f"pressures {np.round(1e-3 * pressure, 2)} kPa; the tip is {history[-1]:.3f} mm from the "
+    "target in the plane"
+)
+print(
+    f"{len(history)} equilibria; distances [mm]:",
+    ", ".join(f"{distance:.2f}" for distance in history[:8]),
+    "...",
+)
 
 # %% [markdown]
 # ## A valve
 #
-# A step of the pressures makes the arm swing. Time-dependent inputs of a roll-out have a leading axis of time.
+# A step of the pressures makes the arm swing. Time-dependent inputs of a roll-out have a leading
+# axis of time.
 
 # %%
 STEPS = 120
@@ -119,13 +141,13 @@ plt.show()
 # %% [markdown]
 # ## Your own arm
 #
-# An experiment needs a mesh with closed chambers, pressures and markers in CSV files, and about twenty lines of
-# configuration: [robots driven by pressure](../actuators.md). With the threads of SoPrA in the simulator
-# (`experiment=sopra_fibres`), the error on its simulated laboratory is 0.44 mm after identification, and 0.23 mm with
-# the learned force ([robots](../robots.md#sopra)).
+# An experiment needs a mesh with closed chambers, pressures and markers in CSV files, and about
+# twenty lines of configuration: [robots driven by pressure](../actuators.md). With the threads of
+# SoPrA in the simulator (`experiment=sopra_fibres`), the error on its simulated laboratory is
+# 0.44 mm after identification, and 0.23 mm with the learned force ([robots](../robots.md#sopra)).
 #
-# The pressures were computed for a simulator. Their accuracy on a robot depends on the correction of the simulator:
-# see [control](control.py).
+# The pressures were computed for a simulator. Their accuracy on a robot depends on the correction
+# of the simulator: see [control](control.py).
 
 # %%
 assert history[-1] < 0.1

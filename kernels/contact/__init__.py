@@ -1,1 +1,3 @@
-"""Contact: distances from obstacles and between triangles, pairs that come near one another, barriers and friction."""
+"""Contact: distances from obstacles and between triangles,
+pairs that come near one another, barriers and friction.
+"""

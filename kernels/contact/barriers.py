@@ -1,7 +1,8 @@
 """Contact of points with obstacles: barrier and lagged, smoothed Coulomb friction.
 
 Equations are in ``energies.contact.obstacle_contact``.
-Here s = d / D, and y = |u| is the slide u of a point in the tangential plane of its normal at the start of the step.
+Here s = d / D, and y = |u| is the slide u of a point in the tangential plane of its normal at the
+start of the step.
 """
 
 import warp as wp
@@ -24,7 +25,7 @@ class Friction:
 
     coefficient: wp.array2d[wp.float64]  # (B, O) mu
     slip: wp.array2d[wp.float64]  # (B, 1) slide at which friction is fully developed [m]
-    load: wp.array3d[wp.float64]  # normal force at the start [N], times the factor of the point's region
+    load: wp.array3d[wp.float64]  # normal force at the start [N], times its region's factor
     normal: wp.array3d[wp.vec3d]  # normal at the start
     reference: wp.array3d[wp.vec3d]  # position without slide [m]
 
@@ -35,12 +36,16 @@ def barrier(s: wp.float64) -> wp.vec3d:
     if s >= ONE:
         return wp.vec3d(ZERO, ZERO, ZERO)
     t, log = s - ONE, wp.log(s)
-    return wp.vec3d(-t * t * log, -TWO * t * log - t * t / s, -TWO * log - FOUR * t / s + t * t / (s * s))
+    return wp.vec3d(
+        -t * t * log, -TWO * t * log - t * t / s, -TWO * log - FOUR * t / s + t * t / (s * s)
+    )
 
 
 @wp.func
 def smoothed(y: wp.float64, slip: wp.float64) -> wp.vec3d:
-    """Returns f(y), f'(y) / y and (f'(y) / y)' / y of the smoothed absolute value (Li et al. 2020), zero at zero."""
+    """Returns f(y), f'(y) / y and (f'(y) / y)' / y of the smoothed absolute value (Li et al. 2020),
+    zero at zero.
+    """
     if y >= slip:
         return wp.vec3d(y - THIRD * slip, ONE / y, -ONE / (y * y * y))
     q = y / slip
@@ -52,7 +57,9 @@ def smoothed(y: wp.float64, slip: wp.float64) -> wp.vec3d:
 
 @wp.func
 def slide(f: Friction, b: int, p: int, k: int, x: wp.vec3d) -> wp.vec3d:
-    """Returns u, the way of a point since the start of the step in the tangential plane of an obstacle."""
+    """Returns u, the way of a point since the start of the step
+    in the tangential plane of an obstacle.
+    """
     m, way = f.normal[b, p, k], x - f.reference[b, p, k]
     return way - wp.dot(way, m) * m
 
@@ -106,7 +113,9 @@ def slide_tangent(m: wp.vec3d, u: wp.vec3d, slip: wp.float64) -> wp.mat33d:
 
 @wp.func
 def friction_tangent(f: Friction, b: int, p: int, k: int, x: wp.vec3d) -> wp.mat33d:
-    """Returns the second derivative of the friction's energy, for mu = 1 and a normal force of one newton."""
+    """Returns the second derivative of the friction's energy,
+    for mu = 1 and a normal force of one newton.
+    """
     return slide_tangent(f.normal[b, p, k], slide(f, b, p, k, x), f.slip[b, 0])
 
 
@@ -122,7 +131,10 @@ def tangent(
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
 ):
-    """Computes the second derivative; a clamped one leaves out that by the curvature of obstacles."""
+    """Computes the second derivative.
+
+    A clamped one leaves out that by the curvature of obstacles.
+    """
     b, p = wp.tid()
     if active[b] == 0:
         return
@@ -143,7 +155,9 @@ def tangent(
 
 @wp.struct
 class Slopes:
-    """Derivatives of a loss by the values of an obstacle and of its friction: parts of the points, (B, P, O)."""
+    """Derivatives of a loss by the values of an obstacle and of its friction:
+    parts of the points, (B, P, O).
+    """
 
     place: wp.array3d[wp.vec3d]
     turn: wp.array3d[wp.mat33d]
@@ -197,12 +211,12 @@ def bound(
     o: Obstacles,
     origin: wp.array2d[wp.vec3d],  # (B, N) without penetration [m]
     positions: wp.array2d[wp.vec3d],  # (B, N) [m]
-    share_out: wp.array[wp.float64],  # (B) lowered to the share of the way from origin that leaves `KEPT` of every gap
+    share_out: wp.array[wp.float64],  # (B) lowered to what of the way leaves `KEPT` of each gap
 ):
     """Bounds a step.
 
-    A convex obstacle lies behind the tangential plane of its place nearest to a point. Along another one the step goes
-    on as far as the largest slope of its distance allows, several times.
+    A convex obstacle lies behind the tangential plane of its place nearest to a point. Along
+    another one the step goes on as far as the largest slope of its distance allows, several times.
     """
     b, p, k = wp.tid()
     if active[b] == 0:

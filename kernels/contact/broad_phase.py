@@ -1,7 +1,8 @@
 """Pairs of a surface of triangles that may come near one another, by a hierarchy of boxes.
 
-Vertices move by at most a radius from the positions for which pairs are sought: pairs within one piece of the surface
-by one around the mean motion of the piece, other pairs by another around the mean motion of all.
+Vertices move by at most a radius from the positions for which pairs are sought: pairs within one
+piece of the surface by one around the mean motion of the piece, other pairs by another around the
+mean motion of all.
 """
 
 import warp as wp
@@ -10,7 +11,8 @@ from .nearest_points import EDGE_EDGE, Corners, apart, nearest
 
 wp.set_module_options({"enable_backward": False})
 
-FLAT = wp.constant(wp.float64(1e-9))  # sine of the angle below which an edge is parallel to a triangle
+# Sine of the angle below which an edge is parallel to a triangle.
+FLAT = wp.constant(wp.float64(1e-9))
 NOTHING = wp.constant(wp.float64(0.0))
 SAFE = wp.constant(wp.float32(1.0 + 1e-6))  # boxes are in float32
 
@@ -31,12 +33,15 @@ class PairKeys:
     """Keys of pairs, in any order; more than fit are only counted."""
 
     count: wp.array[int]  # (1)
-    keys: wp.array[wp.int64]  # number of the environment, and of the pair among all of an environment
+    keys: wp.array[wp.int64]  # number of the environment, and of the pair among all of one
 
 
 @wp.func
 def lower(x: wp.vec3d, r: wp.float64) -> wp.vec3:
-    """Returns the lower corner of a box in float32, rounded outwards; minus that of -x is the upper one."""
+    """Returns the lower corner of a box in float32, rounded outwards.
+
+    Minus that of -x is the upper one.
+    """
     y, e = wp.vec3(x - wp.vec3d(r, r, r)), wp.vec3()
     for i in range(3):
         e[i] = wp.abs(y[i]) * (SAFE - wp.float32(1.0))
@@ -151,6 +156,8 @@ def crossings(
             flat = FLAT * wp.length(wp.cross(q - p, r - p)) * wp.length(y - x)
             if from_x * from_y <= NOTHING and wp.max(wp.abs(from_x), wp.abs(from_y)) > flat:
                 u, v, w = side(p, x, y, q), side(q, x, y, r), side(r, x, y, p)
-                if (u >= NOTHING and v >= NOTHING and w >= NOTHING) or (u <= NOTHING and v <= NOTHING and w <= NOTHING):
+                if (u >= NOTHING and v >= NOTHING and w >= NOTHING) or (
+                    u <= NOTHING and v <= NOTHING and w <= NOTHING
+                ):
                     wp.atomic_add(count_out, b, 1)
                     wp.atomic_min(edge_out, b, e)

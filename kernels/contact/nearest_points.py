@@ -1,10 +1,12 @@
-"""Nearest points of a vertex and a triangle, and of two edges: four vertices x_i, the rows of a matrix.
+"""Nearest points of a vertex and a triangle, and of two edges:
+four vertices x_i, the rows of a matrix.
 
-The vector from the nearest point of the second to that of the first is sum_i w_i x_i = d n, with the distance d, a unit
-vector n and weights w_i. Where the nearest points can slide along directions t_k of the weights, with
-e_k = sum_i t_ki x_i, the distance has the second derivatives
+The vector from the nearest point of the second to that of the first is sum_i w_i x_i = d n, with
+the distance d, a unit vector n and weights w_i. Where the nearest points can slide along directions
+t_k of the weights, with e_k = sum_i t_ki x_i, the distance has the second derivatives
 
-    d H_ij = w_i w_j (1 - n n^T) - sum_kl (t_ki d n + w_i e_k) G_kl (t_lj d n + w_j e_l)^T,    G^-1 = [e_k . e_l].
+    d H_ij = w_i w_j (1 - n n^T) - sum_kl (t_ki d n + w_i e_k) G_kl (t_lj d n + w_j e_l)^T,
+    G^-1 = [e_k . e_l].
 """
 
 import warp as wp
@@ -30,7 +32,7 @@ class Pairs:
     nodes: wp.array[wp.vec4i]
     area: wp.array[wp.float64]  # that a pair stands for [m^2]
     degree: wp.array[wp.vec4d]  # triangles at each of the vertices
-    parallel: wp.array[wp.float64]  # |a x b|^2 of edges below which they count as almost parallel [m^4]
+    parallel: wp.array[wp.float64]  # |a x b|^2 of edges below which they are almost parallel [m^4]
 
 
 @wp.struct
@@ -54,7 +56,10 @@ def along(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d) -> wp.float64:
 
 @wp.func
 def on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3d:
-    """Returns the weights of the corners at the place nearest to p (Ericson 2005); zero on the opposite side."""
+    """Returns the weights of the corners at the place nearest to p (Ericson 2005).
+
+    Zero on the opposite side.
+    """
     ab, ac, ap = b - a, c - a, p - a
     d1, d2 = wp.dot(ab, ap), wp.dot(ac, ap)
     if d1 <= ZERO and d2 <= ZERO:
@@ -85,7 +90,9 @@ def on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def on_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec2d:
-    """Returns the shares of the ways from a to b and from c to d at which the two are nearest (Ericson 2005)."""
+    """Returns the shares of the ways from a to b and from c to d
+    at which the two are nearest (Ericson 2005).
+    """
     e, f, r = b - a, d - c, a - c
     ee, ff, ef = wp.dot(e, e), wp.dot(f, f), wp.dot(e, f)
     er, fr = wp.dot(e, r), wp.dot(f, r)
@@ -103,7 +110,9 @@ def on_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec2d:
 
 @wp.func
 def triangle_weights(feature: int, x: Corners):
-    """Returns w, the number of directions t_k, and these, of a vertex and a feature of a triangle (`nearest`)."""
+    """Returns w, the number of directions t_k, and these,
+    of a vertex and a feature of a triangle (`nearest`).
+    """
     x0, x1, x2, x3 = x[0], x[1], x[2], x[3]
     t, s = wp.vec4d(), wp.vec4d()
     free = 0
@@ -168,8 +177,9 @@ def edge_weights(feature: int, x: Corners):
 def nearest(kind: int, feature: int, x: Corners) -> Nearest:
     """Returns the nearest points of a feature of a pair.
 
-    Features of a vertex x0 and a triangle: 0 the triangle, 1 to 3 its sides opposite to x1 to x3, 4 to 6 its corners.
-    Features of two edges: 3 i + j, where i and j are 0 for an edge, 1 and 2 for its ends.
+    Features of a vertex x0 and a triangle: 0 the triangle, 1 to 3 its sides opposite to x1 to x3, 4
+    to 6 its corners. Features of two edges: 3 i + j, where i and j are 0 for an edge, 1 and 2 for
+    its ends.
     """
     w, t, s = wp.vec4d(), wp.vec4d(), wp.vec4d()
     free = 0
@@ -205,7 +215,8 @@ def nearest(kind: int, feature: int, x: Corners) -> Nearest:
 def part(kind: int, feature: int, degree: wp.vec4d) -> wp.float64:
     """Returns the coefficient of a feature's barrier in that of its pair.
 
-    The sum over all pairs counts what several triangles or edges share once (inclusion and exclusion).
+    The sum over all pairs counts what several triangles or edges share once (inclusion and
+    exclusion).
     """
     if kind == VERTEX_TRIANGLE:
         if feature == 0:
@@ -253,11 +264,12 @@ def bound(
     pairs: Pairs,
     origin: wp.array2d[wp.vec3d],  # (B, N) without penetration [m]
     positions: wp.array2d[wp.vec3d],  # (B, N) [m]
-    share_out: wp.array[wp.float64],  # (B) lowered to the share of the way from origin that leaves `KEPT` of every gap
+    share_out: wp.array[wp.float64],  # (B) lowered to what of the way leaves `KEPT` of each gap
 ):
     """Bounds a step by additive advances (Li, Kaufman and Jiang 2021).
 
-    No point of one part of a pair comes nearer to the other by more than the sum of the largest ways of the two.
+    No point of one part of a pair comes nearer to the other by more than the sum of the largest
+    ways of the two.
     """
     c = wp.tid()
     b = pairs.environment[c]
@@ -293,7 +305,9 @@ def bound(
 def distances(pairs: Pairs, positions: wp.array2d[wp.vec3d], distance_out: wp.array[wp.float64]):
     """Computes the distances of all pairs [m]."""
     c = wp.tid()
-    distance_out[c] = nearest(pairs.kind[c], 0, corners(positions, pairs.environment[c], pairs.nodes[c])).d
+    distance_out[c] = nearest(
+        pairs.kind[c], 0, corners(positions, pairs.environment[c], pairs.nodes[c])
+    ).d
 
 
 @wp.struct
@@ -314,12 +328,16 @@ def pair_features(
     positions: wp.array2d[wp.vec3d],
     features_out: Features,
 ):
-    """Computes weights of nearest points, directions in which these can slide, and parts of all features of pairs."""
+    """Computes weights of nearest points, directions in which these can slide,
+    and parts of all features of pairs.
+    """
     a, feature = wp.tid()
     c = chosen[a]
     kind = pairs.kind[c]
     at = nearest(
-        kind, wp.where(feature < features(kind), feature, 0), corners(positions, pairs.environment[c], pairs.nodes[c])
+        kind,
+        wp.where(feature < features(kind), feature, 0),
+        corners(positions, pairs.environment[c], pairs.nodes[c]),
     )
     features_out.w[a, feature] = at.w
     features_out.t[a, feature] = at.t

@@ -1,8 +1,10 @@
-"""Signed distances of obstacles with their first two derivatives, their pull-back, and queries of closed surfaces.
+"""Signed distances of obstacles with their first two derivatives,
+their pull-back, and queries of closed surfaces.
 
-A point is at y = R^T (x - c) in the axes of an obstacle with place c and rotation R. The signed distance phi(y) of a
-convex obstacle is convex, so that it is d + n . w or more after a way w from a point with the distance d and the normal
-n = grad phi. Sizes s are in metres; the axis of an obstacle is its z.
+A point is at y = R^T (x - c) in the axes of an obstacle with place c and rotation R. The signed
+distance phi(y) of a convex obstacle is convex, so that it is d + n . w or more after a way w from a
+point with the distance d and the normal n = grad phi. Sizes s are in metres; the axis of an
+obstacle is its z.
 
 ================  ==================================================
 `HALF_SPACE`      z <= 0
@@ -29,7 +31,7 @@ class Obstacles:
     """Obstacles of a batch, O of them."""
 
     kind: wp.array[int]  # (O)
-    size: wp.array[wp.vec3d]  # (O) s [m]; of a grid: spacing, largest slope, and least distance at its boundary
+    size: wp.array[wp.vec3d]  # (O) s [m]; grids: spacing, largest slope, least distance at the edge
     low: wp.array[wp.vec3d]  # (O) first node of a grid [m]
     nodes: wp.array[wp.vec4i]  # (O) of a grid: numbers of nodes, and index of its first coefficient
     coefficients: wp.array[wp.float64]  # of the B-splines of all grids, z fastest [m]
@@ -121,7 +123,9 @@ def from_cylinder(y: wp.vec3d, s: wp.vec3d) -> Distance:
 
 @wp.func
 def spline(t: wp.float64, derivative: int) -> wp.vec4d:
-    """Returns the weights of four coefficients at the share t of the interval between the second and the third."""
+    """Returns the weights of four coefficients at the share t of the interval
+    between the second and the third.
+    """
     s = ONE - t
     if derivative == 1:
         middle = wp.vec2d(t * (HALF * THREE * t - TWO), -s * (HALF * THREE * s - TWO))
@@ -134,7 +138,10 @@ def spline(t: wp.float64, derivative: int) -> wp.vec4d:
 
 @wp.func
 def from_grid(o: Obstacles, k: int, y: wp.vec3d) -> Distance:
-    """Returns the interpolated distance; outside of the grid, that from it and the least distance at its boundary."""
+    """Returns the interpolated distance.
+
+    Outside of the grid, that from it and the least distance at its boundary.
+    """
     out = Distance()
     spacing, shape = o.size[k][0], o.nodes[k]
     first = wp.vec3i()
@@ -154,7 +161,12 @@ def from_grid(o: Obstacles, k: int, y: wp.vec3d) -> Distance:
     out.n = wp.vec3d()
     for a in range(4):
         for b in range(4):
-            start = shape[3] + ((first[0] - 1 + a) * shape[1] + first[1] - 1 + b) * shape[2] + first[2] - 1
+            start = (
+                shape[3]
+                + ((first[0] - 1 + a) * shape[1] + first[1] - 1 + b) * shape[2]
+                + first[2]
+                - 1
+            )
             line = wp.vec3d()
             for c in range(4):
                 value = o.coefficients[start + c]
@@ -199,8 +211,12 @@ def distance(o: Obstacles, b: int, k: int, x: wp.vec3d) -> Distance:
 
 
 @wp.func
-def turn_slope(o: Obstacles, b: int, k: int, x: wp.vec3d, at: Distance, a: wp.float64, w: wp.vec3d) -> wp.mat33d:
-    """Returns the derivative of a phi + w . n by the entries of R; that by x is a n + H w, and that by c its negative.
+def turn_slope(
+    o: Obstacles, b: int, k: int, x: wp.vec3d, at: Distance, a: wp.float64, w: wp.vec3d
+) -> wp.mat33d:
+    """Returns the derivative of a phi + w . n by the entries of R.
+
+    That by x is a n + H w, and that by c its negative.
 
     With r = x - c, it is r (a n' + H' w')^T + w n'^T, where primes denote the axes of the obstacle.
     """
@@ -231,7 +247,9 @@ def measure_adjoint(
     position_out: wp.array3d[wp.vec3d],  # (B, P, O) parts of the derivative by the position
     turn_out: wp.array3d[wp.mat33d],  # (B, P, O)
 ):
-    """Computes derivatives of a loss by positions and rotations, from those by distances and normals."""
+    """Computes derivatives of a loss by positions and rotations,
+    from those by distances and normals.
+    """
     b, p, k = wp.tid()
     x = positions[b, p]
     at = distance(o, b, k, x)
@@ -250,7 +268,12 @@ def from_surface(surface: wp.uint64, places: wp.array[wp.vec3], distance_out: wp
 
 
 @wp.kernel(module="unique")
-def blocked(surface: wp.uint64, starts: wp.array[wp.vec3], directions: wp.array[wp.vec3], blocked_out: wp.array[float]):
+def blocked(
+    surface: wp.uint64,
+    starts: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    blocked_out: wp.array[float],
+):
     """Marks rays that hit a surface with one."""
     i = wp.tid()
     if wp.mesh_query_ray(surface, starts[i], directions[i], 1.0e6).result:

@@ -1,4 +1,6 @@
-"""Barrier and friction of pairs of surfaces of triangles (equations in ``energies.contact.surface_contact``)."""
+"""Barrier and friction of pairs of surfaces of triangles (equations in
+``energies.contact.surface_contact``).
+"""
 
 import warp as wp
 
@@ -11,7 +13,9 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def mollifier(c: wp.float64, width: wp.float64) -> wp.vec3d:
-    """Returns m(c), m'(c) and m''(c) of a factor that is zero for parallel edges, c = 0, and one from `width` on."""
+    """Returns m(c), m'(c) and m''(c) of a factor that is zero for parallel edges,
+    c = 0, and one from `width` on.
+    """
     if c >= width:
         return wp.vec3d(ONE, ZERO, ZERO)
     q = c / width
@@ -47,7 +51,9 @@ class Barrier:
 
 
 @wp.func
-def pair_barrier(pairs: Pairs, c: int, x: Corners, stiffness: wp.float64, reach: wp.float64) -> Barrier:
+def pair_barrier(
+    pairs: Pairs, c: int, x: Corners, stiffness: wp.float64, reach: wp.float64
+) -> Barrier:
     """Returns the energy of a pair without the factor for almost parallel edges."""
     kind = pairs.kind[c]
     factor = stiffness * pairs.area[c]
@@ -73,7 +79,9 @@ def pair_forces(
     energy_out: wp.array[wp.float64],  # (C)
     near_out: wp.array[int],  # (C) whether a pair is nearer than D
 ):
-    """Computes gradient and energy of pairs: not a number and infinite at no distance, finite for what has crossed."""
+    """Computes gradient and energy of pairs: not a number and infinite at no distance,
+    finite for what has crossed.
+    """
     c = wp.tid()
     b = pairs.environment[c]
     if active[b] == 0:
@@ -109,10 +117,13 @@ def add_block(out: wp.array3d[wp.float64], a: int, i: int, j: int, block: wp.mat
 
 
 @wp.func
-def add_parallelism(out: wp.array3d[wp.float64], a: int, x: Corners, factor: wp.float64, whole: wp.float64):
+def add_parallelism(
+    out: wp.array3d[wp.float64], a: int, x: Corners, factor: wp.float64, whole: wp.float64
+):
     """Adds the second derivatives of c = |a x b|^2 (`parallelism`) times a factor.
 
-    Those are 2 J^T J, with J of a x b, and the curvature of a x b; `whole` is zero without the latter.
+    Those are 2 J^T J, with J of a x b, and the curvature of a x b; `whole` is zero without the
+    latter.
     """
     e, f = x[1] - x[0], x[3] - x[2]
     ee = -wp.outer(f, f)
@@ -183,7 +194,13 @@ def pair_tangents(
         for i in range(4):
             for j in range(4):
                 outer = wp.outer(slope[i], plain.slope[j]) + wp.outer(plain.slope[i], slope[j])
-                add_block(blocks_out, a, i, j, m[1] * outer + plain.energy * m[2] * wp.outer(slope[i], slope[j]))
+                add_block(
+                    blocks_out,
+                    a,
+                    i,
+                    j,
+                    m[1] * outer + plain.energy * m[2] * wp.outer(slope[i], slope[j]),
+                )
 
 
 @wp.kernel
@@ -195,7 +212,9 @@ def pair_springs(
     positions: wp.array2d[wp.vec3d],
     blocks_out: wp.array3d[wp.float64],  # (A, 12, 12), zero before
 ):
-    """Computes the positive part of `pair_tangents` along the distance, and by the angle of almost parallel edges."""
+    """Computes the positive part of `pair_tangents` along the distance,
+    and by the angle of almost parallel edges.
+    """
     a = wp.tid()
     c = chosen[a]
     b, kind = pairs.environment[c], pairs.kind[c]
@@ -237,7 +256,9 @@ class FrictionPairs:
 def grip_slide(
     grips: FrictionPairs, g: int, positions: wp.array2d[wp.vec3d], reference: wp.array2d[wp.vec3d]
 ) -> wp.vec3d:
-    """Returns u, the relative way of the two parts of a pair since the step began, in its tangential plane."""
+    """Returns u, the relative way of the two parts of a pair since the step began,
+    in its tangential plane.
+    """
     b, v, w, n = grips.environment[g], grips.nodes[g], grips.weights[g], grips.normal[g]
     way = w * (corners(positions, b, v) - corners(reference, b, v))
     return way - wp.dot(way, n) * n
@@ -278,7 +299,9 @@ def grip_tangents(
     g = wp.tid()
     b, w = grips.environment[g], grips.weights[g]
     u = grip_slide(grips, g, positions, reference)
-    block = (coefficient[b, grips.regions[g]] * grips.load[g]) * slide_tangent(grips.normal[g], u, slip[b, 0])
+    block = (coefficient[b, grips.regions[g]] * grips.load[g]) * slide_tangent(
+        grips.normal[g], u, slip[b, 0]
+    )
     for i in range(4):
         for j in range(4):
             add_block(blocks_out, g, i, j, w[i] * w[j] * block)
@@ -291,7 +314,9 @@ def interpolate(
     field: wp.array2d[wp.vec3d],  # (B, N) at control vertices
     field_out: wp.array2d[wp.vec3d],  # (B, N)
 ):
-    """Sets a field at the vertices of a surface from that at control vertices, and leaves it elsewhere."""
+    """Sets a field at the vertices of a surface from that at control vertices,
+    and leaves it elsewhere.
+    """
     b, p = wp.tid()
     field_out[b, vertices[p]] = vector_at(points, field, b, p)
 
@@ -299,7 +324,7 @@ def interpolate(
 @wp.kernel
 def gather(
     start: wp.array[int],  # (B P + 1) first entry of every vertex
-    incident: wp.array[int],  # pair 4 + number of the vertex in it, in ascending order: a fixed summation order
+    incident: wp.array[int],  # 4 pair + its number in it, ascending: a fixed summation order
     force: wp.array[Corners],
     energy: wp.array[wp.float64],
     size: int,  # P
@@ -307,7 +332,9 @@ def gather(
     force_out: wp.array2d[wp.vec3d],  # (B, P)
     energy_out: wp.array2d[wp.float64],
 ):
-    """Sums the gradients of the pairs of every vertex, and the energies of those whose first vertex it is."""
+    """Sums the gradients of the pairs of every vertex,
+    and the energies of those whose first vertex it is.
+    """
     b, p = wp.tid()
     total, sum = wp.vec3d(), wp.float64(0.0)
     row = b * size + p
@@ -347,6 +374,8 @@ def tangent(
     energy: wp.array2d[wp.float64],
     tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
 ):
-    """Sets the second derivatives of single vertices to zero, as all are of pairs (`pair_tangents`)."""
+    """Sets the second derivatives of single vertices to zero,
+    as all are of pairs (`pair_tangents`).
+    """
     b, p = wp.tid()
     tangent_out[b, p, 0] = wp.mat33d()

@@ -1,26 +1,31 @@
-"""A sum of terms with non-negative coefficients: powers of polyconvex invariants, Ogden's terms, and fibres.
+"""A sum of terms with non-negative coefficients: powers of polyconvex invariants,
+Ogden's terms, and fibres.
 
     W = sum_p c_p a^p + sum_p d_p b^p + e j^2 + sum_n 2 mu_n / n^2 S_n
         + sum_f (k_f s(l_f - 1 - slack_f) + k_3 <q_f>^3 + k_c <-q_f>^2)
     U = g_2 j^2 + g_4 j^4
 
-with j = J - 1, a = I1 - 3 - 2 j + j^2, b = I2 - 3 - 4 j, l_f = |F e_f| the stretch of fibres along unit vectors e_f,
-q_f = l_f^2 - 1, and <x> = max(x, 0). With the singular values s_i of F and a whole number n, at least 3 or at most -3,
+with j = J - 1, a = I1 - 3 - 2 j + j^2, b = I2 - 3 - 4 j, l_f = |F e_f| the stretch of fibres along
+unit vectors e_f, q_f = l_f^2 - 1, and <x> = max(x, 0). With the singular values s_i of F and a
+whole number n, at least 3 or at most -3,
 
-    S_n = sum_i s_i^n - 3 - n j + n / 2 j^2  for n > 0,     sum_{i < k} (s_i s_k)^-n - 3 + 2 n j  for n < 0
+    S_n = sum_i s_i^n - 3 - n j + n / 2 j^2           for n > 0,
+          sum_{i < k} (s_i s_k)^-n - 3 + 2 n j        for n < 0
 
-(Ogden, Proceedings of the Royal Society A 326, 1972: for J = 1 they are his). s(x) = max(x, 0)^2 / 2 is smoothed over
-a toe (`kernels.axial.muscle_pull`); its strain is less by the slack, as fibres are wavy. W is integrated at the points
-of the shape rule, U at those of the volume rule.
+(Ogden, Proceedings of the Royal Society A 326, 1972: for J = 1 they are his).
+s(x) = max(x, 0)^2 / 2 is smoothed over a toe (`kernels.axial.muscle_pull`); its strain is less by
+the slack, as fibres are wavy. W is integrated at the points of the shape rule, U at those of the
+volume rule.
 
-All terms and their derivatives vanish at rest, and stay finite where elements invert. a, S_n for n > 0, and l_f are
-convex in (F, J), b and the other S_n in (cof F, J). a, b and l_f are not negative, so that their powers are convex too,
-and every combination with non-negative coefficients is polyconvex (Ball, Archive for Rational Mechanics and Analysis
-63, 1976). The exception is the compression of fibres, <-q_f>^2. At small strains mu is 2 (c_1 + d_1) + sum_n mu_n, and
-lambda, without fibres, 2 (e + g_2), and 2 (1 + 2 / n) mu_n more for each negative n.
+All terms and their derivatives vanish at rest, and stay finite where elements invert. a, l_f, and
+S_n for n > 0, are convex in (F, J), b and the other S_n in (cof F, J). a, b and l_f are not
+negative, so that their powers are convex too, and every combination with non-negative coefficients
+is polyconvex (Ball, Archive for Rational Mechanics and Analysis 63, 1976). The exception is the
+compression of fibres, <-q_f>^2. At small strains mu is 2 (c_1 + d_1) + sum_n mu_n, and lambda,
+without fibres, 2 (e + g_2), and 2 (1 + 2 / n) mu_n more for each negative n.
 
-The moduli named unit_shear and unit_bulk, of value one, carry the volumes of viscosity alone: its coefficients are
-viscosities and moduli of branches, not ratios to the elastic ones.
+The moduli named unit_shear and unit_bulk, of value one, carry the volumes of viscosity alone: its
+coefficients are viscosities and moduli of branches, not ratios to the elastic ones.
 """
 
 from typing import Any
@@ -82,7 +87,9 @@ def by_volume(j: wp.float64, m: Any, exponents: Any, terms: int) -> wp.vec3d:
             linear += FOUR * share
     quartic = m[_G4] * j * j
     slope = TWO * quadratic * j + FOUR * quartic * j
-    return wp.vec3d((linear + (quadratic + quartic) * j) * j, linear + slope, TWO * quadratic + TWELVE * quartic)
+    return wp.vec3d(
+        (linear + (quadratic + quartic) * j) * j, linear + slope, TWO * quadratic + TWELVE * quartic
+    )
 
 
 @wp.func
@@ -91,7 +98,9 @@ def invariant_response(f: wp.mat33d, m: Any, exponents: Any, terms: int):
     cof = cofactor(f)
     first = wp.ddot(f, f)
     k = invariants(first, wp.ddot(cof, cof), wp.determinant(f))
-    by_a, by_b, by_j = powers(k[0], m, 0, _B), powers(k[1], m, _B, _J), by_volume(k[2], m, exponents, terms)
+    by_a = powers(k[0], m, 0, _B)
+    by_b = powers(k[1], m, _B, _J)
+    by_j = by_volume(k[2], m, exponents, terms)
     stress = TWO * (by_a[1] + by_b[1] * first) * f - (TWO * by_b[1]) * (f * (wp.transpose(f) * f))
     stress += (TWO * by_a[1] * (k[2] - ONE) - FOUR * by_b[1] + by_j[1]) * cof
     return by_a[0] + by_b[0] + by_j[0], stress
@@ -99,13 +108,15 @@ def invariant_response(f: wp.mat33d, m: Any, exponents: Any, terms: int):
 
 @wp.func
 def invariant_slopes(f: wp.mat33d, df: wp.mat33d) -> coefficients:
-    """Returns the derivatives of the stress of the terms in invariants : dF by their coefficients."""
+    """Returns the derivatives of the stress of terms in invariants : dF by their coefficients."""
     cof = cofactor(f)
     first = wp.ddot(f, f)
     k = invariants(first, wp.ddot(cof, cof), wp.determinant(f))
     j, change_j = k[2], wp.ddot(cof, df)
     change_a = TWO * wp.ddot(f, df) + TWO * (j - ONE) * change_j
-    change_b = TWO * (first * wp.ddot(f, df) - wp.ddot(f * (wp.transpose(f) * f), df)) - FOUR * change_j
+    change_b = (
+        TWO * (first * wp.ddot(f, df) - wp.ddot(f * (wp.transpose(f) * f), df)) - FOUR * change_j
+    )
     result = coefficients()
     power = ONE
     for n in range(0, _B):
@@ -122,12 +133,16 @@ def invariant_slopes(f: wp.mat33d, df: wp.mat33d) -> coefficients:
 
 
 @wp.func
-def write_invariant_tangent(f: wp.mat33d, m: Any, exponents: Any, terms: int, out: wp.array[wp.mat33d]):
+def write_invariant_tangent(
+    f: wp.mat33d, m: Any, exponents: Any, terms: int, out: wp.array[wp.mat33d]
+):
     """Writes the blocks of dP/dF of the terms in invariants."""
     cof = cofactor(f)
     first = wp.ddot(f, f)
     k = invariants(first, wp.ddot(cof, cof), wp.determinant(f))
-    by_a, by_b, by_j = powers(k[0], m, 0, _B), powers(k[1], m, _B, _J), by_volume(k[2], m, exponents, terms)
+    by_a = powers(k[0], m, 0, _B)
+    by_b = powers(k[1], m, _B, _J)
+    by_j = by_volume(k[2], m, exponents, terms)
     slope = TWO * by_a[1] * (k[2] - ONE) - FOUR * by_b[1] + by_j[1]
     mooney_rivlin.write_tangent(f, by_a[1], by_b[1], slope, TWO * by_a[1] + by_j[2], out)
     columns = wp.transpose(f)
@@ -136,7 +151,9 @@ def write_invariant_tangent(f: wp.mat33d, m: Any, exponents: Any, terms: int, ou
     b = TWO * (first * columns - columns * (f * columns)) - FOUR * normals
     for r in range(3):
         for n in range(r + 1):
-            out[(r * (r + 1)) / 2 + n] += by_a[2] * wp.outer(a[r], a[n]) + by_b[2] * wp.outer(b[r], b[n])
+            out[(r * (r + 1)) / 2 + n] += by_a[2] * wp.outer(a[r], a[n]) + by_b[2] * wp.outer(
+                b[r], b[n]
+            )
 
 
 @wp.func
@@ -144,16 +161,22 @@ def principal_tangent(s: wp.vec3d, m: Any, exponents: Any, terms: int):
     """Returns normal, flip and twist of `spectral_blocks` for signed singular values."""
     cof = wp.vec3d(s[1] * s[2], s[0] * s[2], s[0] * s[1])
     k = invariants(wp.dot(s, s), wp.dot(cof, cof), s[0] * cof[0])
-    by_a, by_b, by_j = powers(k[0], m, 0, _B), powers(k[1], m, _B, _J), by_volume(k[2], m, exponents, terms)
+    by_a = powers(k[0], m, 0, _B)
+    by_b = powers(k[1], m, _B, _J)
+    by_j = by_volume(k[2], m, exponents, terms)
     slope = TWO * by_a[1] * (k[2] - ONE) - FOUR * by_b[1] + by_j[1]
-    normal, flip, twist = mooney_rivlin.principal_tangent(s, by_a[1], by_b[1], slope, TWO * by_a[1] + by_j[2])
+    normal, flip, twist = mooney_rivlin.principal_tangent(
+        s, by_a[1], by_b[1], slope, TWO * by_a[1] + by_j[2]
+    )
     squares = wp.cw_mul(s, s)
     around = wp.vec3d(squares[1] + squares[2], squares[0] + squares[2], squares[0] + squares[1])
     a = TWO * s + (TWO * (k[2] - ONE)) * cof
     b = TWO * wp.cw_mul(s, around) - FOUR * cof
     normal += by_a[2] * wp.outer(a, a) + by_b[2] * wp.outer(b, b)
     for term in range(terms):
-        normal, flip, twist = ogden.with_term(exponents[term], m[_OGDEN + term], s, normal, flip, twist)
+        normal, flip, twist = ogden.with_term(
+            exponents[term], m[_OGDEN + term], s, normal, flip, twist
+        )
     return normal, flip, twist
 
 
@@ -170,15 +193,17 @@ def family(m: Any, first: int) -> Family:
 def convex_law(ogdens: tuple[int, ...], fibres: int) -> Law:
     """Returns the law with Ogden's terms of some exponents, and a number of families of fibres.
 
-    Its moduli are c_1 to c_3, d_1, d_2, e, g_2, g_4, unit_shear, unit_bulk, mu_n of each of Ogden's terms, and
-    e_f (3 components), slack, toe, k_f, k_3 and k_c of each family.
+    Its moduli are c_1 to c_3, d_1, d_2, e, g_2, g_4, unit_shear, unit_bulk, mu_n of each of Ogden's
+    terms, and e_f (3 components), slack, toe, k_f, k_3 and k_c of each family.
     """
     terms, negative = len(ogdens), min(ogdens, default=1) < 0
     exponents = wp.types.vector(max(terms, 1), wp.int32)(*(ogdens or (0,)))
     first_fibre = _OGDEN + terms
     count = first_fibre + Family._length_ * fibres
     moduli = wp.types.vector(count, wp.float64)
-    name = ".".join(str(part).replace("-", "m") for part in ("solid", "convex", *ogdens, f"f{fibres}"))
+    name = ".".join(
+        str(part).replace("-", "m") for part in ("solid", "convex", *ogdens, f"f{fibres}")
+    )
     module = named_module(name)
     wp.set_module_options({"max_unroll": 1}, module)
 

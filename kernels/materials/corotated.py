@@ -1,10 +1,13 @@
-"""``mu ||F - R||^2 + lambda / 2 ||F - D||^2``, with R the nearest rotation and D the nearest matrix of determinant one.
+"""``mu ||F - R||^2 + lambda / 2 ||F - D||^2``, with R the nearest rotation
+and D the nearest matrix of determinant one.
 
-The energy of projective dynamics (Bouaziz et al. 2014). A pure dilation ``F = (1 + e) I`` lies ``sqrt(3) e`` from D but
-has the trace ``3 e``: for small strains the second term is that of linear elasticity with a third of its lambda.
+The energy of projective dynamics (Bouaziz et al. 2014). A pure dilation ``F = (1 + e) I`` lies
+``sqrt(3) e`` from D but has the trace ``3 e``: for small strains the second term is that of linear
+elasticity with a third of its lambda.
 
-F - D is normal to the surface det D = 1 at D, F - D = m cof(D) (Bouaziz et al. 2014, section 5.2). With F = R U and
-D = R V, both V and U = V + m V^-1 are functions of C = F^T F, and their invariants t and i obey
+F - D is normal to the surface det D = 1 at D, F - D = m cof(D) (Bouaziz et al. 2014, section 5.2).
+With F = R U and D = R V, both V and U = V + m V^-1 are functions of C = F^T F, and their invariants
+t and i obey
 
     i_1 = t_1 + m t_2
     i_2 = t_2 + m (t_1 t_2 - 3) + m^2 t_1
@@ -14,8 +17,8 @@ As V^2 = U V - m I, the theorem of Cayley and Hamilton for V gives
 
     V^-1 = (m U + (1 - m t_1) I)^-1 (U^2 - t_1 U + (t_2 - m) I)
 
-so that F - D = m F U^-1 V^-1 is a polynomial in C, whose coefficients need a few numbers and no loop over matrices.
-U follows from C as in `kernels.lanes`.
+so that F - D = m F U^-1 V^-1 is a polynomial in C, whose coefficients need a few numbers and no
+loop over matrices. U follows from C as in `kernels.lanes`.
 """
 
 import warp as wp
@@ -34,9 +37,11 @@ from ..matrices import (
     spectral_blocks,
 )
 
-UPDATE_TOLERANCE = wp.float64(1.0e-30)  # squared norm of the last projection's update, which converges linearly
+# Squared norm of the last projection's update, which converges linearly.
+UPDATE_TOLERANCE = wp.float64(1.0e-30)
 NEARLY_A_LINE = wp.float64(1.0e-3)
-LARGEST_GROWTH = wp.float64(0.4)  # |J - 1| up to which Newton's iteration converges, and to the nearest D
+# |J - 1| up to which Newton's iteration converges, and to the nearest D
+LARGEST_GROWTH = wp.float64(0.4)
 NEWTON_ITERATIONS, PROJECTIONS = 8, 60
 ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
 THREE, FOUR, EIGHT, TWELVE = wp.float64(3.0), wp.float64(4.0), wp.float64(8.0), wp.float64(12.0)
@@ -89,8 +94,8 @@ def multiplier(i1: wp.float64, i2: wp.float64, growth: wp.float64):
 def projected(f: wp.mat33d) -> wp.mat33d:
     """Returns D by successive projection of F on the tangent plane of {det D = 1} at the last D.
 
-    The start is F, or the rotation of F if F is nearly a line or a point and its own tangent plane is undefined. For an
-    inverted F the result may be another stationary point.
+    The start is F, or the rotation of F if F is nearly a line or a point and its own tangent plane
+    is undefined. For an inverted F the result may be another stationary point.
     """
     d = f
     c = cofactor(f)
@@ -119,7 +124,8 @@ def unimodular_offset(f: wp.mat33d) -> wp.mat33d:
         i2 = HALF * (i1 * i1 - c1)
         m, t2, converged = multiplier(i1, i2, j - ONE)
         if has_trace and converged:
-            # (m U + d I)^-1 = (q_2 U^2 + q_1 U + q_0 I) / n; w_k: coefficients of U^k in its product with the others
+            # (m U + d I)^-1 = (q_2 U^2 + q_1 U + q_0 I) / n; w_k: coefficients of U^k in its
+            # product with the others
             t1 = i1 - m * t2
             d, e = ONE - m * t1, t2 - m
             q2, q1 = m * m, -m * (i1 * m + d)
@@ -141,7 +147,10 @@ def unimodular_offset(f: wp.mat33d) -> wp.mat33d:
 
 @wp.func
 def response(f: wp.mat33d, m: wp.vec2d):
-    """Returns energy and stress; both terms are w/2 dist^2(F, manifold), so that P = w (F - projection of F)."""
+    """Returns energy and stress.
+
+    Both terms are w/2 dist^2(F, manifold), so that P = w (F - projection of F).
+    """
     energy = ZERO
     stress = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
     if m[0] > ZERO:
@@ -169,11 +178,14 @@ def slopes(f: wp.mat33d, df: wp.mat33d, m: wp.vec2d, carried: wp.vec2d) -> wp.ve
 @wp.func
 def second_derivatives(s: wp.vec3d, d: wp.vec3d, shape: wp.float64, volume: wp.float64):
     """Returns normal (3, 3), flip and twist (`spectral_blocks`); d are the singular values of D."""
-    # D shares F's singular frame: s = d + m cof(d), prod d = 1. Differentiating both gives the 3x3 block of
-    # dD as the projection on the surface's tangent plane in the metric I + m (d off the diagonal).
+    # D shares F's singular frame: s = d + m cof(d), prod d = 1. Differentiating both gives the 3x3
+    # block of dD as the projection on the surface's tangent plane in the metric I + m (d off the
+    # diagonal).
     cof = wp.vec3d(d[1] * d[2], d[0] * d[2], d[0] * d[1])
     m = wp.dot(s - d, cof) / wp.dot(cof, cof)
-    inverse = wp.inverse(wp.mat33d(ONE, m * d[2], m * d[1], m * d[2], ONE, m * d[0], m * d[1], m * d[0], ONE))
+    inverse = wp.inverse(
+        wp.mat33d(ONE, m * d[2], m * d[1], m * d[2], ONE, m * d[0], m * d[1], m * d[0], ONE)
+    )
     icof = inverse * cof
     normal = volume * (wp.outer(icof, icof) / wp.dot(cof, icof) - inverse)
     flip = wp.vec3d(ZERO, ZERO, ZERO)
@@ -187,15 +199,21 @@ def second_derivatives(s: wp.vec3d, d: wp.vec3d, shape: wp.float64, volume: wp.f
     return normal, flip, twist
 
 
-# The rotation R of F = R S turns by dR = [w]_x R, w = A^-1 a, where A = tr(S) I - R S R^T and a is the axial vector
-# of dF R^T - R dF^T. A change x of column n of F has a = (R e_n) x x, so that block (k, n) of dR is
+# The rotation R of F = R S turns by dR = [w]_x R, w = A^-1 a, where A = tr(S) I - R S R^T and a is
+# the axial vector of dF R^T - R dF^T. A change x of column n of F has a = (R e_n) x x, so that
+# block (k, n) of dR is
 # -[R e_k]_x A^-1 [R e_n]_x.
 @wp.func
 def turning(f: wp.mat33d, r: wp.mat33d) -> wp.mat33d:
-    """Returns A^-1, which makes the rotation w of dR = [w]_x R of the axial vector of dF R^T - R dF^T."""
+    """Returns A^-1, which makes the rotation w of dR = [w]_x R
+    of the axial vector of dF R^T - R dF^T.
+    """
     stretch = f * wp.transpose(r)
     t = wp.trace(stretch)
-    return wp.inverse(wp.mat33d(t, ZERO, ZERO, ZERO, t, ZERO, ZERO, ZERO, t) - HALF * (stretch + wp.transpose(stretch)))
+    return wp.inverse(
+        wp.mat33d(t, ZERO, ZERO, ZERO, t, ZERO, ZERO, ZERO, t)
+        - HALF * (stretch + wp.transpose(stretch))
+    )
 
 
 @wp.func
@@ -229,5 +247,11 @@ def tangent(f: wp.mat33d, m: wp.vec2d, clamp: bool, out: wp.array[wp.mat33d]):
 
 
 LAW = Law(
-    "solid.corotated", wp.vec2d, response, slopes, tangent, lame=((1.0, 0.0), (0.0, 1.0 / 3.0)), has_lanes=True
-)  # of the values mu and lambda
+    "solid.corotated",
+    wp.vec2d,  # mu and lambda
+    response,
+    slopes,
+    tangent,
+    lame=((1.0, 0.0), (0.0, 1.0 / 3.0)),
+    has_lanes=True,
+)

@@ -1,8 +1,9 @@
 """Material law from energy densities given as Warp functions of F and any number of parameters.
 
-The energy of a point is V_s W(F, p) + V_v U(F, p): W at the points of the shape term, U at the fewer points of the
-volume term. Its values are (V_s, V_v, mu V_s, lambda V_v, p_1, ..., p_n); the third and fourth serve viscosity.
-`kernels.energy_functions` describes the derivatives and their accuracy.
+The energy of a point is V_s W(F, p) + V_v U(F, p): W at the points of the shape term, U at the
+fewer points of the volume term. Its values are (V_s, V_v, mu V_s, lambda V_v, p_1, ..., p_n); the
+third and fourth serve viscosity. `kernels.energy_functions` describes the derivatives and their
+accuracy.
 """
 
 from typing import Any

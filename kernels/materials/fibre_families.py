@@ -1,4 +1,6 @@
-"""Families of fibres in a solid, k_f s(l - 1 - slack) + k_3 <q>^3 + k_c <-q>^2 (``kernels.materials.convex``)."""
+"""Families of fibres in a solid, k_f s(l - 1 - slack) + k_3 <q>^3 + k_c <-q>^2
+(``kernels.materials.convex``).
+"""
 
 import warp as wp
 
@@ -41,7 +43,9 @@ def fibre_slopes(f: wp.mat33d, df: wp.mat33d, m: Family) -> Family:
     q, change = wp.dot(c, c) - ONE, TWO * wp.dot(c, moved)
     w = by_square(q, m)
     back = wp.transpose(f)
-    by_direction = (TWO * w[2] * change) * (back * c) + (TWO * w[1]) * (back * moved + wp.transpose(df) * c)
+    by_direction = (TWO * w[2] * change) * (back * c) + (TWO * w[1]) * (
+        back * moved + wp.transpose(df) * c
+    )
     taut = wp.max(q, ZERO)
     stretch = wp.sqrt(ONE + taut)
     strain, toe = stretch - ONE - m[3], m[4]

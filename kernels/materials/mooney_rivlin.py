@@ -1,10 +1,11 @@
 """``c10 ((I1 - 3) - 2 (J - 1) + (J - 1)^2) + c01 ((I2 - 3) - 4 (J - 1)) + lambda / 2 (J - 1)^2``.
 
-The rubber of Mooney (1940) and Rivlin (1948), with I1 = ||F||^2, I2 = ||cof F||^2 and J = det F, made compressible by
-polynomials of J for which the rest shape is free of stress and the first two terms have no volume stiffness at small
-strains: there the material is linear elasticity with mu = 2 (c10 + c01) and lambda. It stays finite where
-elements invert. With c01 = 0 it is the stable neo-Hookean material of Smith, de Goes and Kim (2018) without its
-logarithm, and with lambda shifted by mu so that small strains give exactly linear elasticity.
+The rubber of Mooney (1940) and Rivlin (1948), with I1 = ||F||^2, I2 = ||cof F||^2 and J = det F,
+made compressible by polynomials of J for which the rest shape is free of stress and the first two
+terms have no volume stiffness at small strains: there the material is linear elasticity with mu = 2
+(c10 + c01) and lambda. It stays finite where elements invert. With c01 = 0 it is the stable
+neo-Hookean material of Smith, de Goes and Kim (2018) without its logarithm, and with lambda shifted
+by mu so that small strains give exactly linear elasticity.
 """
 
 import warp as wp
@@ -43,13 +44,20 @@ def slopes(f: wp.mat33d, df: wp.mat33d, m: wp.vec3d, carried: wp.vec3d) -> wp.ve
     jac = wp.determinant(f)
     along = wp.ddot(cofactor(f), df)
     second = wp.ddot(f, f) * wp.ddot(f, df) - wp.ddot(f * (wp.transpose(f) * f), df)
-    return wp.vec3d(TWO * wp.ddot(f, df) + TWO * (jac - TWO) * along, TWO * second - FOUR * along, (jac - ONE) * along)
+    return wp.vec3d(
+        TWO * wp.ddot(f, df) + TWO * (jac - TWO) * along,
+        TWO * second - FOUR * along,
+        (jac - ONE) * along,
+    )
 
 
-# With the principal stresses sigma_i of I2, 2 s_i (s_j^2 + s_k^2), and of a function g of J, g' s_j s_k:
-# the flip of the pair (i, j) is 2 (s_k^2 - s_i s_j) and -g' s_k, its twist 2 (s_k^2 + s_i s_j) and g' s_k.
+# With the principal stresses sigma_i of I2, 2 s_i (s_j^2 + s_k^2), and of a function g of J, g' s_j
+# s_k: the flip of the pair (i, j) is 2 (s_k^2 - s_i s_j) and -g' s_k, its twist 2 (s_k^2 + s_i s_j)
+# and g' s_k.
 @wp.func
-def principal_tangent(s: wp.vec3d, first: wp.float64, second: wp.float64, slope: wp.float64, curvature: wp.float64):
+def principal_tangent(
+    s: wp.vec3d, first: wp.float64, second: wp.float64, slope: wp.float64, curvature: wp.float64
+):
     """Returns normal, flip and twist of `spectral_blocks` for an energy of I1, I2 and J.
 
     Args:
@@ -85,7 +93,10 @@ def write_tangent(
     curvature: wp.float64,
     out: wp.array[wp.mat33d],
 ):
-    """Writes the blocks of dP/dF by the equation above; the arguments are those of `principal_tangent`."""
+    """Writes the blocks of dP/dF by the equation above.
+
+    The arguments are those of `principal_tangent`.
+    """
     columns = wp.transpose(f)
     normals = wp.transpose(cofactor(f))
     for k in range(3):
@@ -118,7 +129,9 @@ def write_tangent(
 
 @wp.func
 def tangent(f: wp.mat33d, m: wp.vec3d, clamp: bool, out: wp.array[wp.mat33d]):
-    """Writes the blocks of dP/dF, with `clamp` those of the nearest tangent without negative eigenvalues."""
+    """Writes the blocks of dP/dF, with `clamp` those of the nearest tangent
+    without negative eigenvalues.
+    """
     curvature = TWO * m[0] + m[2]
     if clamp:
         u, s, v = signed_svd(f)
@@ -130,4 +143,11 @@ def tangent(f: wp.mat33d, m: wp.vec3d, clamp: bool, out: wp.array[wp.mat33d]):
 
 
 # Of the values c10, c01 and lambda.
-LAW = Law("solid.mooney_rivlin", wp.vec3d, response, slopes, tangent, lame=((2.0, 0.0), (2.0, 0.0), (0.0, 1.0)))
+LAW = Law(
+    "solid.mooney_rivlin",
+    wp.vec3d,
+    response,
+    slopes,
+    tangent,
+    lame=((2.0, 0.0), (2.0, 0.0), (0.0, 1.0)),
+)

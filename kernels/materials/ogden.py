@@ -1,4 +1,6 @@
-"""Ogden's terms with whole exponents, 2 / n^2 S_n of ``kernels.materials.convex`` without their part in j."""
+"""Ogden's terms with whole exponents, 2 / n^2 S_n of ``kernels.materials.convex``
+without their part in j.
+"""
 
 import warp as wp
 
@@ -25,7 +27,9 @@ def odd_power(x: wp.float64, n: int) -> wp.float64:
 
 @wp.func
 def quotient(x: wp.float64, y: wp.float64, n: int) -> wp.float64:
-    """Returns the difference of `odd_power` between x and y over x - y, also where they are equal, for n >= 1."""
+    """Returns the difference of `odd_power` between x and y over x - y,
+    also where they are equal, for n >= 1.
+    """
     if n % 2 == 0 and x * y <= ZERO:
         apart = x - y
         if apart == ZERO:
@@ -52,7 +56,9 @@ def matrix_power(a: wp.mat33d, n: int) -> wp.mat33d:
 
 @wp.func
 def unsigned_polar(f: wp.mat33d):
-    """Returns R and U of F = R U, with U positive semi-definite and an orthogonal R, also where F is inverted."""
+    """Returns R and U of F = R U, with U positive semi-definite and an orthogonal R,
+    also where F is inverted.
+    """
     if wp.determinant(f) > ZERO:
         r = polar_rotation(f)
         return r, wp.transpose(r) * f
@@ -87,7 +93,9 @@ def term(f: wp.mat33d, turn: wp.mat33d, u: wp.mat33d, n: int):
 
 
 @wp.func
-def with_term(n: int, modulus: wp.float64, s: wp.vec3d, normal: wp.mat33d, flip: wp.vec3d, twist: wp.vec3d):
+def with_term(
+    n: int, modulus: wp.float64, s: wp.vec3d, normal: wp.mat33d, flip: wp.vec3d, twist: wp.vec3d
+):
     """Returns normal, flip and twist of `spectral_blocks` with those of a term."""
     k = wp.abs(n) - 1
     scale = TWO * modulus / wp.float64(k + 1)
@@ -111,10 +119,20 @@ def with_term(n: int, modulus: wp.float64, s: wp.vec3d, normal: wp.mat33d, flip:
     return normal, flip, twist
 
 
-# The stress is 2 mu_n / n R U^(n - 1): L C^k with C = F^T F, k = (n - 1) // 2, and L = R for odd n, F for even ones.
+# The stress is 2 mu_n / n R U^(n - 1): L C^k with C = F^T F, k = (n - 1) // 2, and L = R for odd n,
+# F for even ones.
 @wp.func
-def add_tangent(f: wp.mat33d, r: wp.mat33d, turn: wp.mat33d, n: int, modulus: wp.float64, out: wp.array[wp.mat33d]):
-    """Adds the blocks of dP/dF of a term with n > 0, for det F > 0, its rotation r and the `turning` of both."""
+def add_tangent(
+    f: wp.mat33d,
+    r: wp.mat33d,
+    turn: wp.mat33d,
+    n: int,
+    modulus: wp.float64,
+    out: wp.array[wp.mat33d],
+):
+    """Adds the blocks of dP/dF of a term with n > 0, for det F > 0,
+    its rotation r and the `turning` of both.
+    """
     back = wp.transpose(f)
     c = back * f
     scale = TWO * modulus / wp.float64(n)

@@ -1,4 +1,6 @@
-"""A step of grippers in a grasp: two soft fingers with tendons close on a soft ball on a table, and lift it."""
+"""A step of grippers in a grasp: two soft fingers with tendons close
+on a soft ball on a table, and lift it.
+"""
 
 import argparse
 import math
@@ -33,7 +35,9 @@ D: Final = 5e-4  # distance at which contact begins [m]
 STIFFNESS, FRICTION, SLIP_SPEED = 5e4, 0.5, 5e-3  # [Pa], 1, [m/s]
 CLOSED, LIFTED, RISE, TIME_STEP = 0.2, 0.5, 0.03, 0.01  # times [s] and height [m] of a grasp
 TENSIONS: Final = (1.2, 1.8)  # of the first and the last gripper [N]; one alone has the largest
-RUBBER: Final = Corotated(youngs_modulus=2.5e5, poissons_ratio=0.45, density=1070.0, stiffness_damping=4e-3)
+RUBBER: Final = Corotated(
+    youngs_modulus=2.5e5, poissons_ratio=0.45, density=1070.0, stiffness_damping=4e-3
+)
 BATCHES: Final = {"cpu": (1, 16), "cuda": (1, 16, 256, 1024)}
 STEPS: Final = round(LIFTED / TIME_STEP)
 
@@ -41,21 +45,33 @@ STEPS: Final = round(LIFTED / TIME_STEP)
 def finger(side: float, divisions: tuple[int, int, int]) -> Body:
     """Returns a finger that hangs beside the ball, with a tendon 3 mm below its inner face."""
     box, inner = box_hexahedra((SIDE, SIDE, LENGTH), divisions), RADIUS + GAP
-    mesh = replace(box, vertices=box.vertices - [SIDE / 2, SIDE / 2, LENGTH] + [0.0, side * (inner + SIDE / 2), 0.0])
+    mesh = replace(
+        box,
+        vertices=box.vertices
+        - [SIDE / 2, SIDE / 2, LENGTH]
+        + [0.0, side * (inner + SIDE / 2), 0.0],
+    )
     tendon = Tendons([[[0.0, side * (inner + 0.003), z] for z in np.linspace(0.0, -LENGTH, 11)]])
     return Body(mesh, fixed=select_vertices(mesh, z=0.0), energies=[tendon])
 
 
-def grasp(arguments: argparse.Namespace, batch: int, contact: bool) -> tuple[int, Callable[[], dict[str, float]]]:
-    """Returns the unknowns of a gripper, and a task: a batch of them closes on the ball and lifts it.
+def grasp(
+    arguments: argparse.Namespace, batch: int, contact: bool
+) -> tuple[int, Callable[[], dict[str, float]]]:
+    """Returns unknowns of a gripper, and a task: a batch of them closes on the ball and lifts it.
 
-    The task returns the time of a step of all grippers, and how many hold the ball; without contact, fingers pass
-    through it.
+    The task returns the time of a step of all grippers, and how many hold the ball; without
+    contact, fingers pass through it.
     """
     ball = ball_mesh(RADIUS, 4)
     ball = replace(ball, vertices=ball.vertices + [0.0, 0.0, TABLE + RADIUS + 0.9 * D])
-    table = Contact({"table": HalfSpace(position=(0.0, 0.0, TABLE))}, STIFFNESS, FRICTION, D, SLIP_SPEED)
-    bodies = {name: finger(side, tuple(arguments.fingers)) for name, side in (("left", -1.0), ("right", 1.0))}
+    table = Contact(
+        {"table": HalfSpace(position=(0.0, 0.0, TABLE))}, STIFFNESS, FRICTION, D, SLIP_SPEED
+    )
+    bodies = {
+        name: finger(side, tuple(arguments.fingers))
+        for name, side in (("left", -1.0), ("right", 1.0))
+    }
     bodies["ball"] = Body(ball, energies=[table] if contact else [])
     scene = Scene(bodies, SurfaceContact(STIFFNESS, FRICTION, D, SLIP_SPEED) if contact else None)
     solver = SolverSettings(relative_tolerance=1e-6, factors=arguments.factors)
@@ -80,7 +96,12 @@ def grasp(arguments: argparse.Namespace, batch: int, contact: bool) -> tuple[int
         pairs = PairList(Launcher(batch, device), Surface.of(scene.mesh), D)
         crossings = sum(int(pairs.crossings(q)[0].sum()) for q in path.q[:: STEPS // 10].double())
         held = int((height > 0.9 * RISE).sum())
-        return {"ms": 1e3 * seconds, "iterations": solves(path)["iterations"], "held": held, "crossings": crossings}
+        return {
+            "ms": 1e3 * seconds,
+            "iterations": solves(path)["iterations"],
+            "held": held,
+            "crossings": crossings,
+        }
 
     lift()  # compiles kernels
     return free_unknowns(simulator), lift
@@ -90,9 +111,23 @@ def measure_grippers(arguments: argparse.Namespace) -> dict[str, Any]:
     """Times a step of grippers, with contact and without."""
     rows = list[dict[str, Any]]()
     for batch in arguments.batches or BATCHES[choose_device(arguments.device).type]:
-        (unknowns, lift), (_, without) = (grasp(arguments, batch, contact) for contact in (True, False))
+        (unknowns, lift), (_, without) = (
+            grasp(arguments, batch, contact) for contact in (True, False)
+        )
         (touching, free), _ = take_turns(f"{batch} grippers", [lift, without], arguments.repeats)
         ms = touching.pop("ms")
-        head = {"grippers": batch, "unknowns": unknowns, "grasp_ms": ms, "steps_per_s": 1e3 * batch / ms}
-        rows.append({**head, **touching, "without_contact_ms": free["ms"], "iterations_without": free["iterations"]})
+        head = {
+            "grippers": batch,
+            "unknowns": unknowns,
+            "grasp_ms": ms,
+            "steps_per_s": 1e3 * batch / ms,
+        }
+        rows.append(
+            {
+                **head,
+                **touching,
+                "without_contact_ms": free["ms"],
+                "iterations_without": free["iterations"],
+            }
+        )
     return {f"a step of {1e3 * TIME_STEP:g} ms of all grippers": rows}

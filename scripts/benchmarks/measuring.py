@@ -1,7 +1,8 @@
 """Timing in turns, beside a yardstick.
 
-The speed of a machine varies. Cases therefore take turns, medians are reported, and a fixed task of LAPACK, the
-yardstick, is timed with them, so that times over the yardstick can be compared between days and machines.
+The speed of a machine varies. Cases therefore take turns, medians are reported, and a fixed task of
+LAPACK, the yardstick, is timed with them, so that times over the yardstick can be compared between
+days and machines.
 """
 
 import time
@@ -41,7 +42,8 @@ def median_ms(task: Callable[[], object], repeats: int, device: torch.device = C
 def take_turns(
     title: str, tasks: Sequence[Callable[[], Mapping[str, float]]], repeats: int
 ) -> tuple[list[dict[str, float]], float]:
-    """Runs tasks in turns, and returns the medians of the figures that each returns, and of the yardstick [ms].
+    """Runs tasks in turns, and returns the medians of the figures
+    that each returns, and of the yardstick [ms].
 
     The yardstick is a product and a Cholesky factor of 480 x 480 in NumPy, on one thread.
     """
@@ -54,14 +56,23 @@ def take_turns(
                 timed.append(task())
                 progress.advance()
             with threadpool_limits(1):
-                yardsticks.append(median_ms(lambda: np.linalg.cholesky(random @ random.T + _SIZE * np.eye(_SIZE)), 5))
-    return [{name: median(row[name] for row in timed) for name in timed[0]} for timed in figures], median(yardsticks)
+                yardsticks.append(
+                    median_ms(
+                        lambda: np.linalg.cholesky(random @ random.T + _SIZE * np.eye(_SIZE)), 5
+                    )
+                )
+    return [
+        {name: median(row[name] for row in timed) for name in timed[0]} for timed in figures
+    ], median(yardsticks)
 
 
 def solves(path: Motion) -> dict[str, float]:
     """Returns the mean numbers of iterations and factorisations in a step of a roll-out."""
     counts = ("iterations", "factorisations")
-    return {name: float(np.mean([getattr(r, name).double().mean().item() for r in path.reports])) for name in counts}
+    return {
+        name: float(np.mean([getattr(r, name).double().mean().item() for r in path.reports]))
+        for name in counts
+    }
 
 
 def free_unknowns(simulator: Simulator) -> int:

@@ -1,4 +1,6 @@
-"""A step of robots on an arm of six joints, over a step of the same robots whose base moves in the same way."""
+"""A step of robots on an arm of six joints, over a step of the same robots
+whose base moves in the same way.
+"""
 
 import argparse
 from collections.abc import Callable
@@ -19,7 +21,14 @@ from warp_resphys.settings.run import RunSettings
 from .measuring import now, take_turns
 
 STEPS: Final = 40
-_LINKS: Final = ((0.1, "0 0 1"), (0.25, "0 1 0"), (0.2, "0 1 0"), (0.1, "1 0 0"), (0.08, "0 1 0"), (0.05, "1 0 0"))
+_LINKS: Final = (
+    (0.1, "0 0 1"),
+    (0.25, "0 1 0"),
+    (0.2, "0 1 0"),
+    (0.1, "1 0 0"),
+    (0.08, "0 1 0"),
+    (0.05, "1 0 0"),
+)
 _HOLD: Final = np.array([0.0, -0.6, 1.0, 0.0, 0.5, 0.0])  # angles of the joints [rad]
 _SWING: Final = 0.3  # of all joints [rad]
 _LAST_MASS: Final = 0.1  # of the mounting body [kg]
@@ -31,43 +40,68 @@ def arm(time_step: float) -> str:
     for number, (length, axis) in enumerate(_LINKS):
         name, mass = ("flange", _LAST_MASS) if number == 5 else (f"link_{number}", 10.0 * length)
         bodies += (
-            f'<body name="{name}" pos="{place}"><joint name="joint_{number}" axis="{axis}" damping="2"/>'
-            f'<geom type="capsule" fromto="0 0 0 {length} 0 0" size=".03" mass="{mass}" contype="0" conaffinity="0"/>'
+            f'<body name="{name}" pos="{place}"><joint name="joint_{number}" axis="{axis}" '
+            f'damping="2"/><geom type="capsule" fromto="0 0 0 {length} 0 0" size=".03" '
+            f'mass="{mass}" contype="0" conaffinity="0"/>'
         )
         ends, place = f"{ends}</body>", f"{length} 0 0"
     motors = "".join(f'<position joint="joint_{number}" kp="300"/>' for number in range(6))
     option = f'<option timestep="{time_step}" gravity="0 0 -9.80709" integrator="implicitfast"/>'
-    return f"<mujoco>{option}<worldbody>{bodies}{ends}</worldbody><actuator>{motors}</actuator></mujoco>"
+    world = f"<worldbody>{bodies}{ends}</worldbody>"
+    return f"<mujoco>{option}{world}<actuator>{motors}</actuator></mujoco>"
 
 
 def measure_mounts(arguments: argparse.Namespace) -> dict[str, Any]:
     """Moves the arm, by turns with the robot alone on the same motion of its base.
 
     Returns:
-        Of every batch and number of substeps of MuJoCo, medians of a step of all robots on their arms and alone [ms],
-        their ratio, and the time of `Mount.begin`; and the time of the yardstick.
+        Of every batch and number of substeps of MuJoCo, medians of a step of all robots on their
+        arms and alone [ms], their ratio, and the time of `Mount.begin`; and the time of the
+        yardstick.
 
     Raises:
         InputError: an unknown setting, or MuJoCo is not installed.
     """
-    overrides = ["time_step=0.005", "integrator=implicit_euler", f"device={choose_device(arguments.device)}"]
+    overrides = [
+        "time_step=0.005",
+        "integrator=implicit_euler",
+        f"device={choose_device(arguments.device)}",
+    ]
     settings = parse(RunSettings, composed("config", [*overrides, *arguments.settings]))
     description = Description(
-        "beam", "simulation", SimulatorSettings.of(settings), settings.simulation, build_mesh(settings.mesh)
+        "beam",
+        "simulation",
+        SimulatorSettings.of(settings),
+        settings.simulation,
+        build_mesh(settings.mesh),
     )
-    robot, rows, yardsticks = Robot(description, choose_device(arguments.device)), list[dict[str, Any]](), []
+    robot = Robot(description, choose_device(arguments.device))
+    rows = list[dict[str, Any]]()
+    yardsticks = []
     for batch in arguments.batches:
         for substeps in arguments.substeps:
             cases, timed = _cases(robot, batch, substeps)
-            (both, alone), yardstick = take_turns(f"{batch} arms, {substeps} substeps", cases, arguments.repeats)
-            about = {"arms": batch, "substeps": substeps, "vertices": robot.simulator.body.n_vertices}
-            times = {"coupled_ms": both["ms"], "alone_ms": alone["ms"], "ratio": both["ms"] / alone["ms"]}
+            (both, alone), yardstick = take_turns(
+                f"{batch} arms, {substeps} substeps", cases, arguments.repeats
+            )
+            about = {
+                "arms": batch,
+                "substeps": substeps,
+                "vertices": robot.simulator.body.n_vertices,
+            }
+            times = {
+                "coupled_ms": both["ms"],
+                "alone_ms": alone["ms"],
+                "ratio": both["ms"] / alone["ms"],
+            }
             rows.append({**about, **times, "begin_ms": timed})
             yardsticks.append(yardstick)
     return {"a step of all robots on arms": rows, "yardstick_ms": float(np.median(yardsticks))}
 
 
-def _cases(robot: Robot, batch: int, substeps: int) -> tuple[list[Callable[[], dict[str, float]]], float]:
+def _cases(
+    robot: Robot, batch: int, substeps: int
+) -> tuple[list[Callable[[], dict[str, float]]], float]:
     """Returns tasks with and without the arm, and the time of `Mount.begin` [ms]."""
     mujoco = mujoco_package()
     mount = Mount(robot, mujoco.MjModel.from_xml_string(arm(robot.time_step / substeps)), "flange")
@@ -81,7 +115,8 @@ def _cases(robot: Robot, batch: int, substeps: int) -> tuple[list[Callable[[], d
     first = mount.begin(starts)
     timed = 1e3 * (now(device) - began)
     controls = [
-        np.stack([start.qpos for start in starts]) + _SWING * np.sin(0.03 * number) ** 2 for number in range(STEPS)
+        np.stack([start.qpos for start in starts]) + _SWING * np.sin(0.03 * number) ** 2
+        for number in range(STEPS)
     ]
 
     def coupled(keep: list[MountedState] | None = None) -> dict[str, float]:

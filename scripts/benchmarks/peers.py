@@ -1,14 +1,17 @@
-"""A soft block in contact beside Newton's vertex block descent (VBD) and MuJoCo's flexes: time at equal error.
+"""A soft block in contact beside Newton's vertex block descent (VBD)
+and MuJoCo's flexes: time at equal error.
 
-=====  ================================================================================================================
-slide  a block that rests on a floor is given a speed v, and stops after v^2 / (2 mu g); the error is that of the way
-grip   walls squeeze a block, which their friction holds; the error is the mean distance of its vertices at the end from
-       where this simulator leads with almost rigid walls and almost dry friction
-=====  ================================================================================================================
+=====  =====================================================================================
+slide  a block that rests on a floor is given a speed v, and stops after v^2 / (2 mu g); the
+       error is that of the way
+grip   walls squeeze a block, which their friction holds; the error is the mean distance of
+       its vertices at the end from where this simulator leads with almost rigid walls and
+       almost dry friction
+=====  =====================================================================================
 
-All simulate the same tetrahedra of a stable neo-Hookean solid with implicit steps of first order, VBD in float32.
-Contact acts at vertices: here by a barrier from a distance D on, which keeps every vertex outside, in the peers by
-penalties from the surface on, which vertices penetrate.
+All simulate the same tetrahedra of a stable neo-Hookean solid with implicit steps of first order,
+VBD in float32. Contact acts at vertices: here by a barrier from a distance D on, which keeps every
+vertex outside, in the peers by penalties from the surface on, which vertices penetrate.
 """
 
 import argparse
@@ -40,14 +43,16 @@ from warp_resphys.stepping.state import State
 from .measuring import now, take_turns
 
 Array = NDArray[np.float64]
-Run = Callable[[Array, Array, int], tuple[float, Array]]  # q, v (N, 3), T to seconds a step and positions (T, N, 3)
+# q, v (N, 3), T to seconds a step and positions (T, N, 3)
+Run = Callable[[Array, Array, int], tuple[float, Array]]
 OURS: Final = "warp_resphys"
 SIZE: Final = (0.06, 0.04, 0.03)  # of the block [m]
 MODULUS, RATIO, DENSITY, G = 30e3, 0.45, 1070.0, 9.81  # SI units
 FRICTION, SLIP_SPEED, STIFFNESS, SPEED = 0.5, 1e-3, 1e5, 1.0  # 1, [m/s], [Pa], [m/s]
 SQUEEZE: Final = 0.1  # share of the width by which walls squeeze the block that is held
 SETTLING, DURATION = 0.1, 0.25  # before the block is given its speed, and after [s]
-SETTINGS: Final[Mapping[str, Sequence[tuple[Any, ...]]]] = {  # of the programs, the time step [s] first
+# Of the programs, the time step [s] first.
+SETTINGS: Final[Mapping[str, Sequence[tuple[Any, ...]]]] = {
     OURS: [  # distance at which contact begins [m], relative residual
         (4e-3, 1e-4, 1e-2),
         (2e-3, 1e-3, 1e-2),
@@ -89,14 +94,18 @@ class Scene:
     @classmethod
     def of(cls, name: str, divisions: tuple[int, int, int]) -> "Scene":
         """Returns the scene slide, a block on a floor, or grip, a block between two walls."""
-        mesh, y, z = box_tetrahedra(SIZE, divisions), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+        mesh = box_tetrahedra(SIZE, divisions)
+        y = np.array([0.0, 1.0, 0.0])
+        z = np.array([0.0, 0.0, 1.0])
         if name == "slide":
             return cls(mesh, ((np.zeros(3), z),), SPEED)
         near = 0.5 * SQUEEZE * SIZE[1] * y
         return cls(mesh, ((near, y), (SIZE[1] * y - near, -y)))
 
     def start(self, clearance: float) -> Array:
-        """Returns positions (N, 3) of the vertices at a distance from the planes [m], squeezed if there are two."""
+        """Returns positions (N, 3) of the vertices at a distance from the planes [m],
+        squeezed if there are two.
+        """
         q = self.mesh.vertices
         if len(self.planes) == 1:
             return np.asarray(q + clearance * self.planes[0][1])
@@ -105,18 +114,28 @@ class Scene:
         return np.asarray(middle + (q - middle) * [across, 1.0 - strain, across])
 
     def measure(self, run: Run, time_step: float, clearance: float) -> tuple[float, Array, Array]:
-        """Returns seconds a step, and positions (N, 3) after the block has settled and (T, N, 3) after that."""
-        q, first, steps = self.start(clearance), round(SETTLING / time_step), round(DURATION / time_step)
+        """Returns seconds a step, and positions (N, 3)
+        after the block has settled and (T, N, 3) after that.
+        """
+        q = self.start(clearance)
+        first = round(SETTLING / time_step)
+        steps = round(DURATION / time_step)
         before, settled = run(q, 0.0 * q, first)
         seconds, positions = run(settled[-1], 0.0 * q + [self.speed, 0.0, 0.0], steps)
         return (before * first + seconds * steps) / (first + steps), settled[-1], positions
 
-    def compare(self, run: Run, time_step: float, clearance: float, expected: Array) -> dict[str, float]:
-        """Runs the scene once: time of a step, the same over the simulated time, error and penetration."""
+    def compare(
+        self, run: Run, time_step: float, clearance: float, expected: Array
+    ) -> dict[str, float]:
+        """Runs the scene once: time of a step, the same over the simulated time,
+        error and penetration.
+        """
         seconds, settled, q = self.measure(run, time_step, clearance)
         gap = min(float(((q - point) @ normal).min()) for point, normal in self.planes)
         if self.speed:
-            error = abs(float((q[-1] - settled)[:, 0].mean()) - self.speed**2 / (2.0 * FRICTION * G))
+            error = abs(
+                float((q[-1] - settled)[:, 0].mean()) - self.speed**2 / (2.0 * FRICTION * G)
+            )
         else:
             error = float(np.linalg.norm(q[-1] - expected, axis=-1).mean())
         figures = {"time_ms": 1e3 * seconds, "load": seconds / time_step}
@@ -139,34 +158,59 @@ def measure_peers(arguments: argparse.Namespace) -> dict[str, Any]:
     for name in ("slide", "grip"):
         scene = Scene.of(name, tuple(arguments.divisions))
         rigid = ours(scene, device, 5e-4, 1e-5, 1e-8, slip_share=0.1)
-        expected = scene.measure(rigid, 5e-4, 1e-5)[2][-1] if name == "grip" else scene.mesh.vertices
+        expected = (
+            scene.measure(rigid, 5e-4, 1e-5)[2][-1] if name == "grip" else scene.mesh.vertices
+        )
         heads, tasks = list[dict[str, Any]](), list[Callable[[], dict[str, float]]]()
         for program in (OURS, *arguments.programs):
             for h, *values in SETTINGS[program]:
-                heads.append({"program": program, "step_ms": 1e3 * h, "setting": ", ".join(map(str, values))})
-                run, clearance = MAKERS[program](scene, device, h, *values), values[0] if program == OURS else 0.0
+                heads.append(
+                    {"program": program, "step_ms": 1e3 * h, "setting": ", ".join(map(str, values))}
+                )
+                run = MAKERS[program](scene, device, h, *values)
+                clearance = values[0] if program == OURS else 0.0
                 tasks.append(partial(scene.compare, run, h, clearance, expected))
         figures, _ = take_turns(name, tasks, arguments.repeats)
         rows = [{**head, **measured} for head, measured in zip(heads, figures, strict=True)]
-        tables[name] = [{**row, "our_load_at_that_error": at_equal_error(row, rows)} for row in rows]
+        tables[name] = [
+            {**row, "our_load_at_that_error": at_equal_error(row, rows)} for row in rows
+        ]
     return tables
 
 
 def at_equal_error(row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
-    """Returns our least load at no more than the error of a peer's row, as text; a dash if no row reaches it."""
-    loads = [other["load"] for other in rows if other["program"] == OURS and other["error_mm"] <= row["error_mm"]]
+    """Returns our least load at no more than the error of a peer's row, as text.
+
+    A dash if no row reaches it.
+    """
+    loads = [
+        other["load"]
+        for other in rows
+        if other["program"] == OURS and other["error_mm"] <= row["error_mm"]
+    ]
     return "" if row["program"] == OURS else f"{min(loads):.3g}" if loads else "-"
 
 
-def ours(scene: Scene, device: torch.device, h: float, distance: float, tolerance: float, slip_share: float = 1) -> Run:
-    """Prepares roll-outs of this simulator with steps of h; the solver stops at a relative residual."""
+def ours(
+    scene: Scene,
+    device: torch.device,
+    h: float,
+    distance: float,
+    tolerance: float,
+    slip_share: float = 1,
+) -> Run:
+    """Prepares roll-outs of this simulator with steps of h.
+
+    The solver stops at a relative residual.
+    """
     planes = {
         f"plane{number}": HalfSpace(position=tuple(point - _AWAY * normal), axis=tuple(normal))
         for number, (point, normal) in enumerate(scene.planes)
     }
     contact = Contact(planes, STIFFNESS, FRICTION, distance, slip_share * SLIP_SPEED)
     material = StableNeoHookean(density=DENSITY, youngs_modulus=MODULUS, poissons_ratio=RATIO)
-    body, solver = Body(scene.mesh, energies=[contact]), SolverSettings(relative_tolerance=tolerance)
+    body = Body(scene.mesh, energies=[contact])
+    solver = SolverSettings(relative_tolerance=tolerance)
     s = Simulator(body, material, h, (0.0, 0.0, -G), solver=solver, device=device)
 
     @torch.no_grad()
@@ -179,7 +223,9 @@ def ours(scene: Scene, device: torch.device, h: float, distance: float, toleranc
     return run
 
 
-def vbd(scene: Scene, device: torch.device, h: float, iterations: int, stiffness: float, damping: float) -> Run:
+def vbd(
+    scene: Scene, device: torch.device, h: float, iterations: int, stiffness: float, damping: float
+) -> Run:
     """Prepares roll-outs of Newton's VBD with steps of h, as graphs of two steps."""
     newton: Any = import_module("newton")
     builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, -G))
@@ -205,7 +251,9 @@ def vbd(scene: Scene, device: torch.device, h: float, iterations: int, stiffness
         setattr(model, f"soft_contact_{name}", value)
         getattr(model, f"shape_material_{name}").fill_(value)
     collisions = newton.CollisionPipeline(model)
-    contacts, control, states = collisions.contacts(), model.control(), [model.state(), model.state()]
+    contacts = collisions.contacts()
+    control = model.control()
+    states = [model.state(), model.state()]
     solver = newton.solvers.SolverVBD(model, iterations=iterations, friction_epsilon=SLIP_SPEED)
 
     def two_steps() -> None:
@@ -232,8 +280,17 @@ def vbd(scene: Scene, device: torch.device, h: float, iterations: int, stiffness
     return run
 
 
-def flex(scene: Scene, _: torch.device, h: float, solver: str, tolerance: float, reaction: float, limit: float) -> Run:
-    """Prepares roll-outs of MuJoCo with steps of h, on the CPU: vertices are bodies on three slides, as in `flexcomp`.
+def flex(
+    scene: Scene,
+    _: torch.device,
+    h: float,
+    solver: str,
+    tolerance: float,
+    reaction: float,
+    limit: float,
+) -> Run:
+    """Prepares roll-outs of MuJoCo with steps of h, on the CPU: vertices are bodies on three
+    slides, as in `flexcomp`.
 
     Contact has a time constant, ``reaction`` [s], and an impedance, ``limit``.
     """
@@ -243,23 +300,36 @@ def flex(scene: Scene, _: torch.device, h: float, solver: str, tolerance: float,
     spec = mujoco.MjSpec()
     spec.memory = 1 << 28
     option = spec.option
-    option.timestep, option.gravity, option.impratio = h, (0.0, 0.0, -G), 10.0  # as advised for grasping
-    option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_DISCRETE, mujoco.mjtCone.mjCONE_ELLIPTIC
+    # As advised for grasping.
+    option.timestep, option.gravity, option.impratio = h, (0.0, 0.0, -G), 10.0
+    option.integrator, option.cone = (
+        mujoco.mjtIntegrator.mjINT_DISCRETE,
+        mujoco.mjtCone.mjCONE_ELLIPTIC,
+    )
     option.solver, option.tolerance = getattr(mujoco.mjtSolver, f"mjSOL_{solver}"), tolerance
     for point, normal in scene.planes:
-        plane = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, pos=point, size=(0.0, 0.0, 0.01), priority=1)
+        plane = spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_PLANE, pos=point, size=(0.0, 0.0, 0.01), priority=1
+        )
         plane.alt.type, plane.alt.zaxis = mujoco.mjtOrientation.mjORIENTATION_ZAXIS, normal
         plane.friction, plane.solref = (FRICTION, 0.0, 0.0), (reaction, 1.0)
         plane.solimp = (limit, limit, 1e-3, 0.5, 2.0)
     masses = np.bincount(mesh.cells.ravel(), np.repeat(0.25 * DENSITY * cell_volumes(mesh), 4))
     names = [f"vertex{number}" for number in range(len(masses))]
     for name, vertex, mass in zip(names, mesh.vertices, masses, strict=True):
-        body = spec.worldbody.add_body(name=name, pos=vertex, mass=mass, inertia=(1e-9,) * 3, explicitinertial=True)
+        body = spec.worldbody.add_body(
+            name=name, pos=vertex, mass=mass, inertia=(1e-9,) * 3, explicitinertial=True
+        )
         for axis in np.eye(3):
             body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
     block = spec.add_flex(name="block", dim=3, young=MODULUS, poisson=RATIO, radius=0.0)
     block.elastic3d, block.selfcollide = 1, mujoco.mjtFlexSelf.mjFLEXSELF_NONE
-    block.vertbody, block.elem, block.contype, block.conaffinity = names, mesh.cells.ravel().tolist(), 1, 1
+    block.vertbody, block.elem, block.contype, block.conaffinity = (
+        names,
+        mesh.cells.ravel().tolist(),
+        1,
+        1,
+    )
     model, rest = spec.compile(), mesh.vertices
     data = mujoco.MjData(model)
 

@@ -1,7 +1,8 @@
-"""A step of a roll-out with the reaction of its clamp, over the same step without, for a beam and for SoPrA's arm.
+"""A step of a roll-out with the reaction of its clamp,
+over the same step without, for a beam and for SoPrA's arm.
 
-Both alternate, and costs are medians over pairs. Kernels and the solver's copy of the gradient at fixed vertices, less
-than 0.1 % of a step, are in both.
+Both alternate, and costs are medians over pairs. Kernels and the solver's copy of the gradient at
+fixed vertices, less than 0.1 % of a step, are in both.
 """
 
 import argparse
@@ -29,9 +30,10 @@ def measure_reactions(arguments: argparse.Namespace) -> dict[str, Any]:
     """Times a step of every body with and without its reaction.
 
     Returns:
-        Of every body, medians of a step with the reaction [ms]: without gradients (plain), of the forward pass with
-        them, of it and the backward pass of a loss on the last state (gradient), and of the backward pass of a loss on
-        the reactions too; what the reaction adds to the first three [%]; and the time of the yardstick.
+        Of every body, medians of a step with the reaction [ms]: without gradients (plain), of the
+        forward pass with them, of it and the backward pass of a loss on the last state (gradient),
+        and of the backward pass of a loss on the reactions too; what the reaction adds to the first
+        three [%]; and the time of the yardstick.
     """
     rows, yardsticks = list[dict[str, Any]](), list[float]()
     for name in arguments.bodies:
@@ -40,14 +42,20 @@ def measure_reactions(arguments: argparse.Namespace) -> dict[str, Any]:
         task = _pair(settings, simulator, arguments.steps)
         task()
         ((times,), yardstick) = take_turns(name, [task], arguments.repeats)
-        head = {"body": name, "unknowns": free_unknowns(simulator), "fixed_vertices": len(simulator.fixed)}
+        head = {
+            "body": name,
+            "unknowns": free_unknowns(simulator),
+            "fixed_vertices": len(simulator.fixed),
+        }
         rows.append({**head, **times})
         yardsticks.append(yardstick)
     return {"a step with the reaction": rows, "yardstick_ms": float(np.median(yardsticks))}
 
 
-def _pair(settings: RunSettings, simulator: Simulator, steps: int) -> Callable[[], dict[str, float]]:
-    """Returns a task that makes roll-outs with and without the reaction, in an order that alternates."""
+def _pair(
+    settings: RunSettings, simulator: Simulator, steps: int
+) -> Callable[[], dict[str, float]]:
+    """A task that makes roll-outs with and without the reaction, in an order that alternates."""
     start, inputs = loaded(simulator, 1, steps)
     modulus, numbers = "youngs_modulus", count()
     device, stiffness = start.q.device, simulator.tensor([settings.simulation.values[modulus]])
@@ -59,10 +67,15 @@ def _pair(settings: RunSettings, simulator: Simulator, steps: int) -> Callable[[
         plain, leaf = now(device) - began, stiffness.clone().requires_grad_()
         began = now(device)
         motion = simulator.rollout(start, steps, inputs, {modulus: leaf})
-        forward, loss = now(device) - began, motion.q[-1].square().sum() + motion.v[-1].square().sum()
+        forward = now(device) - began
+        loss = motion.q[-1].square().sum() + motion.v[-1].square().sum()
         began = now(device)
         torch.autograd.grad(loss, leaf, retain_graph=True)
-        times = {"plain_ms": plain, "forward_ms": forward, "gradient_ms": forward + now(device) - began}
+        times = {
+            "plain_ms": plain,
+            "forward_ms": forward,
+            "gradient_ms": forward + now(device) - began,
+        }
         if motion.reaction is not None:
             began = now(device)
             torch.autograd.grad(loss + motion.reaction.forces.square().sum(), leaf)
@@ -81,7 +94,10 @@ def _pair(settings: RunSettings, simulator: Simulator, steps: int) -> Callable[[
             less, whole = without(), timed()
         else:
             whole, less = timed(), without()
-        costs = {f"{name.removesuffix('_ms')}_cost_percent": 100.0 * (whole[name] / less[name] - 1.0) for name in less}
+        costs = {
+            f"{name.removesuffix('_ms')}_cost_percent": 100.0 * (whole[name] / less[name] - 1.0)
+            for name in less
+        }
         return {**whole, **costs}
 
     return both

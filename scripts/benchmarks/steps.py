@@ -1,4 +1,6 @@
-"""A step of an experiment's body, forward and backward: by solver, material and batch, or by linear solver and size."""
+"""A step of an experiment's body, forward and backward: by solver,
+material and batch, or by linear solver and size.
+"""
 
 import argparse
 import time
@@ -29,7 +31,10 @@ MATERIALS: Final[Mapping[str, Mapping[str, Any]]] = {
     "configured": {},
 }
 BATCHES: Final[Mapping[str, Sequence[int]]] = {"cpu": (1, 4, 16), "cuda": (1, 16, 256, 1024, 4096)}
-FLOOR: Final = ("obstacles.floor={shape: half_space, position: [0.0, 0.0, -0.004]}", "contact.friction=0.3")
+FLOOR: Final = (
+    "obstacles.floor={shape: half_space, position: [0.0, 0.0, -0.004]}",
+    "contact.friction=0.3",
+)
 STEPS: Final = "a step of the whole batch"
 _DEFAULTS: Final = ("solver.relative_tolerance=1e-6", "solver.max_iterations=20000")
 _MODULUS: Final = "youngs_modulus"
@@ -46,11 +51,13 @@ def task_of(
     straight: bool = False,
     pressure: float = PRESSURE,
 ) -> tuple[Simulator, Callable[[], dict[str, float]]]:
-    """Returns the simulator of an experiment's body, and a task, which has run once and compiled kernels.
+    """Returns the simulator of an experiment's body, and a task,
+    which has run once and compiled kernels.
 
-    The task times a step of the whole batch without gradients (plain; cpu: processor time of all threads), with them,
-    and in the backward pass. The gradient is that of the sum of squares of the last state, with respect to the first
-    state, a force on every vertex at every step, and Young's modulus.
+    The task times a step of the whole batch without gradients (plain; cpu: processor time of all
+    threads), with them, and in the backward pass. The gradient is that of the sum of squares of the
+    last state, with respect to the first state, a force on every vertex at every step, and Young's
+    modulus.
 
     Args:
         settings: of a run.
@@ -66,8 +73,12 @@ def task_of(
     simulator = build_simulator(settings, law, build_body(settings))
     start, inputs = simulator.rest_state(batch), Inputs()
     if not straight:
-        start, inputs = loaded(simulator, batch, steps, -1.0 if settings.obstacles else 1.0, pressure)
-    parameters = {_MODULUS: simulator.tensor([law.values[_MODULUS]])} if _MODULUS in law.values else {}
+        start, inputs = loaded(
+            simulator, batch, steps, -1.0 if settings.obstacles else 1.0, pressure
+        )
+    parameters = (
+        {_MODULUS: simulator.tensor([law.values[_MODULUS]])} if _MODULUS in law.values else {}
+    )
     device = start.q.device
 
     def measure(steps: int = steps, inputs: Inputs = inputs) -> dict[str, float]:
@@ -85,7 +96,12 @@ def task_of(
         began = now(device)
         torch.autograd.grad(loss, [q, v, force, *moduli.values()])
         backward = now(device) - began
-        times = {"plain_ms": plain, "cpu_ms": worked, "forward_ms": forward, "backward_ms": backward}
+        times = {
+            "plain_ms": plain,
+            "cpu_ms": worked,
+            "forward_ms": forward,
+            "backward_ms": backward,
+        }
         speed = {"steps_per_s": batch * steps / plain, **solves(path)}
         return {**{name: 1e3 * seconds / steps for name, seconds in times.items()}, **speed}
 
@@ -96,10 +112,11 @@ def task_of(
 def loaded(
     simulator: Simulator, batch: int, steps: int, sign: float = 1.0, largest: float = PRESSURE
 ) -> tuple[State, Inputs]:
-    """Returns start and inputs of a roll-out: let go under a weight or, with chambers, at rest before pressures rise.
+    """Returns start and inputs of a roll-out: let go under a weight or,
+    with chambers, at rest before pressures rise.
 
-    The weight hangs at the end that is farthest from the fixed vertices along the body; it is lighter in each further
-    environment, and lifts the end where ``sign`` is negative.
+    The weight hangs at the end that is farthest from the fixed vertices along the body; it is
+    lighter in each further environment, and lifts the end where ``sign`` is negative.
     """
     chambers = simulator.counts.get("pressure", 0)
     shares = simulator.tensor(np.arange(batch) / batch)
@@ -107,7 +124,9 @@ def loaded(
         phase = simulator.tensor(np.arange(steps)[:, None, None] / steps)
         shift = simulator.tensor(np.arange(chambers) / chambers) + shares[:, None]
         pressure = 0.5 * largest * (1.0 - torch.cos(2.0 * torch.pi * (phase + shift)))  # (T, B, n)
-        return simulator.static_equilibrium(Inputs(pressure=pressure[0])).detach(), Inputs(pressure=pressure)
+        return simulator.static_equilibrium(Inputs(pressure=pressure[0])).detach(), Inputs(
+            pressure=pressure
+        )
     rest = simulator.rest_positions
     along = rest[:, int((rest.amax(0) - rest.amin(0)).argmax())]
     distance = (along - along[simulator.fixed].mean()).abs()
@@ -119,7 +138,12 @@ def loaded(
 
 def run_settings(arguments: argparse.Namespace, *overrides: str) -> RunSettings:
     """Returns the settings of a run, as the command line composes them."""
-    overrides = (*_DEFAULTS, *arguments.settings, *overrides, f"device={choose_device(arguments.device)}")
+    overrides = (
+        *_DEFAULTS,
+        *arguments.settings,
+        *overrides,
+        f"device={choose_device(arguments.device)}",
+    )
     return parse(RunSettings, composed("config", overrides))
 
 
@@ -127,13 +151,18 @@ def measure_steps(arguments: argparse.Namespace) -> dict[str, Any]:
     """Times steps and their parts."""
     device = choose_device(arguments.device)
     settings = run_settings(arguments, *(FLOOR if arguments.floor else ()))
-    cases = [*product(arguments.solvers, arguments.materials, arguments.batches or BATCHES[device.type])]
+    cases = [
+        *product(arguments.solvers, arguments.materials, arguments.batches or BATCHES[device.type])
+    ]
     simulators, tasks = zip(
-        *(task_of(settings, *case, arguments.steps, pressure=arguments.pressure) for case in cases), strict=True
+        *(task_of(settings, *case, arguments.steps, pressure=arguments.pressure) for case in cases),
+        strict=True,
     )
     measured, yardstick = take_turns("steps", tasks, arguments.repeats)
     steps, parts = Rows(), Rows()
-    for (solver, material, batch), simulator, times in zip(cases, simulators, measured, strict=True):
+    for (solver, material, batch), simulator, times in zip(
+        cases, simulators, measured, strict=True
+    ):
         head: dict[str, Any] = {"solver": solver, "material": material, "batch": batch}
         relative = {"yardsticks": (times["forward_ms"] + times["backward_ms"]) / yardstick}
         steps.append({**head, "unknowns": free_unknowns(simulator), **times, **relative})
@@ -142,7 +171,9 @@ def measure_steps(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def part_times(simulator: Simulator, batch: int, repeats: int) -> dict[str, Any]:
-    """Returns the median times of the parts of an iteration [ms] in the last state of a batch, of its first shard."""
+    """Returns the median times of the parts of an iteration [ms]
+    in the last state of a batch, of its first shard.
+    """
     workspace = simulator.workspace(batch).parts[0][1]
     potential = workspace.potential
     linear = workspace.linear_solver(simulator.settings.linear_solver, simulator.dtype)
@@ -159,14 +190,19 @@ def part_times(simulator: Simulator, batch: int, repeats: int) -> dict[str, Any]
         "solve": lambda: factor.solve(right),
     }
     with threads_for(linear.n):  # as in a step
-        times = {f"{name}_ms": median_ms(part, 5 * repeats, potential.device) for name, part in parts.items()}
+        times = {
+            f"{name}_ms": median_ms(part, 5 * repeats, potential.device)
+            for name, part in parts.items()
+        }
     return {"linear_solver": type(linear).__name__, **times}
 
 
 def measure_sizes(arguments: argparse.Namespace) -> dict[str, Any]:
     """Times a body that starts straight, by linear solver and size, one case after the other."""
     rows = Rows()
-    for material, linear, refinement in product(arguments.materials, arguments.linear_solvers, arguments.refinements):
+    for material, linear, refinement in product(
+        arguments.materials, arguments.linear_solvers, arguments.refinements
+    ):
         settings = run_settings(arguments, f"solver.linear_solver={linear}")
         if refinement != 1.0:
             settings = settings.changed(mesh=finer(settings.mesh, refinement))

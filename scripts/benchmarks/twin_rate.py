@@ -1,4 +1,6 @@
-"""A twin on the trials of a run: computing times on one thread, and errors of predictions beside simpler ones."""
+"""A twin on the trials of a run: computing times on one thread,
+and errors of predictions beside simpler ones.
+"""
 
 import argparse
 import time
@@ -20,9 +22,10 @@ def measure_twin(arguments: argparse.Namespace) -> dict[str, Any]:
     """Lets a twin follow trials, packet by packet, as fast as it can.
 
     Returns:
-        Of every trial, median and 99th percentile of the time of an estimate, and median time of a prediction [ms];
-        mean errors [mm] at the horizon of the twin, of markers that are held, and of the twin's engine without markers;
-        the share of errors within intervals of 90 %, the number of predictions, and the best of the three.
+        Of every trial, median and 99th percentile of the time of an estimate, and median time of a
+        prediction [ms]; mean errors [mm] at the horizon of the twin, of markers that are held, and
+        of the twin's engine without markers; the share of errors within intervals of 90 %, the
+        number of predictions, and the best of the three.
 
     Raises:
         InputError: an unknown model, trial or setting.
@@ -30,7 +33,8 @@ def measure_twin(arguments: argparse.Namespace) -> dict[str, Any]:
     """
     overrides = [f"twin.{word}" for word in ("horizon=0.1", *arguments.settings)]
     settings = parse(TwinSettings, composed("view", ["run=''", *overrides])["twin"])
-    robot, rows = load(arguments.run, arguments.model, device=arguments.device), list[dict[str, Any]]()
+    robot = load(arguments.run, arguments.model, device=arguments.device)
+    rows = list[dict[str, Any]]()
     known = trial_names(robot)
     names = arguments.trials or known
     if unknown := [name for name in names if name not in known]:
@@ -53,10 +57,18 @@ def measure_twin(arguments: argparse.Namespace) -> dict[str, Any]:
                     with suppress(ConvergenceError):  # The twin counts it.
                         twin.ahead()
                     predictions.append(1e3 * (time.perf_counter() - began))
-            row = {"trial": name, "estimate_ms": np.median(estimates), "p99_ms": np.percentile(estimates, 99)}
+            row = {
+                "trial": name,
+                "estimate_ms": np.median(estimates),
+                "p99_ms": np.percentile(estimates, 99),
+            }
             rows.append({**row, "prediction_ms": np.median(predictions)})
             if (off := twin.disagreement) is not None:
                 rows[-1] |= {"twin_mm": off.twin, "held_mm": off.held, "engine_mm": off.simulator}
-                rows[-1] |= {"covered": off.covered, "predictions": off.predictions, "best": off.best}
+                rows[-1] |= {
+                    "covered": off.covered,
+                    "predictions": off.predictions,
+                    "best": off.best,
+                }
             progress.advance()
     return {f"twin, {settings.engine}, {settings.horizon:g} s ahead": rows}

@@ -1,4 +1,6 @@
-"""A small experiment with control through its command line: reduced models, plans, and who drives the laboratory."""
+"""A small experiment with control through its command line:
+reduced models, plans, and who drives the laboratory.
+"""
 
 import json
 from dataclasses import replace
@@ -15,7 +17,13 @@ from support.main_job import DRIVEN, IN_RUN, ROD, run, run_without_report
 from support.refusals import refuses
 from warp_resphys import Contact, HalfSpace, InputError, Twin, pipeline
 from warp_resphys.control import sampling
-from warp_resphys.control.control_files import PLANNED, plans_file, read_motion, read_reduced, reduced_file
+from warp_resphys.control.control_files import (
+    PLANNED,
+    plans_file,
+    read_motion,
+    read_reduced,
+    reduced_file,
+)
 from warp_resphys.control.control_stages import controllers_of, driven_settings, replay
 from warp_resphys.control.controllers import Estimator
 from warp_resphys.control.polynomials import SquaredPolynomial
@@ -36,8 +44,12 @@ CONTROL = [
     "+identify.parameters.tendon_tension_factor={lower:0.5,upper:1.5}",
     "+identify.parameters.tendon_tension_delay={lower:0.0,upper:0.05}",
     "+identify.parameters.tendon_tension_rise={lower:0.001,upper:0.1,logarithmic:true}",
-    "+identify.first_guess={tendon_tension_factor:0.9,tendon_tension_delay:0.012,tendon_tension_rise:0.02}",
-    *("control.models=[sysid,resphys]", "control.shapes=[circle]", "control.seconds=[0.4]", "control.size=0.01"),
+    "+identify.first_guess={tendon_tension_factor:0.9,tendon_tension_delay:0.012,"
+    "tendon_tension_rise:0.02}",
+    "control.models=[sysid,resphys]",
+    "control.shapes=[circle]",
+    "control.seconds=[0.4]",
+    "control.size=0.01",
     *("control.plan={corrections:2,reach:0.05}", "control.horizon=0.1"),
     *("control.feedback={gains:[5.0],settles:0.1}",),
     "control.reduction={modes:[1,4],equilibria:48,tangents:24,motions:3,seconds:2.0}",
@@ -74,7 +86,9 @@ def control_of(folder):
 
 
 def test_a_body_that_fails_or_begins_again_rests_and_the_other_goes_on(folder):
-    laboratory = Laboratory(driven_settings(folder), folder, "tendon_tension", 2, seed=0, on_failure="count")
+    laboratory = Laboratory(
+        driven_settings(folder), folder, "tendon_tension", 2, seed=0, on_failure="count"
+    )
     rest, commands = laboratory.markers(laboratory.rest), np.tile([1.0, 0.0, 0.0], (2, 1))
     state = laboratory.step(laboratory.rest, commands)
     assert not laboratory.lost(state).any()
@@ -125,9 +139,13 @@ class TestReducedModel:
         assert quality["window_relative"] == quality["tried"]["4"] < 0.5 * quality["tried"]["1"]
 
     def test_a_material_that_relaxes_keeps_its_branches(self, folder):
-        """Small vibrations after a push are those of the full robot, and others without the branches."""
+        """Small vibrations after a push are those of the full robot,
+        and others without the branches.
+        """
         robot = warp_resphys.load(folder, "sysid").with_parameters(prony_ratio_1=1.5)
-        model = reduce(robot, ReductionSettings(modes=(4,), equilibria=20, tangents=20, motions=2, seconds=0.4))
+        model = reduce(
+            robot, ReductionSettings(modes=(4,), equilibria=20, tangents=20, motions=2, seconds=0.4)
+        )
         assert model.times == (0.05,)
         start, speed = robot.begin(), 1e-2 * model.basis[:, 0].reshape(1, -1, 3)
         pushed = replace(start, v=robot.simulator.tensor(speed))
@@ -136,9 +154,13 @@ class TestReducedModel:
         true = np.einsum("tni,n,ni->t", q[1:] - q[0], mass, shape)
         commands, rest = np.zeros((30, 1, 3)), model.rest()
         still = replace(rest, v=rest.v + 1e-2 * np.eye(4)[:1])
-        elastic = replace(model, branches=SquaredPolynomial(0.0 * model.branches.coefficients, model.branches.order))
+        elastic = replace(
+            model,
+            branches=SquaredPolynomial(0.0 * model.branches.coefficients, model.branches.order),
+        )
         off, without = (
-            np.linalg.norm((one.move(still, commands)[0] - rest.z)[:, 0, 0] - true) for one in (model, elastic)
+            np.linalg.norm((one.move(still, commands)[0] - rest.z)[:, 0, 0] - true)
+            for one in (model, elastic)
         )
         assert off < 0.03 * np.linalg.norm(true)
         assert without > 0.2 * np.linalg.norm(true)
@@ -163,22 +185,34 @@ class TestReducedModel:
         np.testing.assert_allclose(estimator.state.z, state.z, atol=2e-6)
         np.testing.assert_allclose(estimator.bias, elsewhere, atol=2e-5)
 
-    def test_friction_a_medium_obstacles_and_data_driven_robots_are_refused(self, robot, monkeypatch, folder):
+    def test_friction_a_medium_obstacles_and_data_driven_robots_are_refused(
+        self, robot, monkeypatch, folder
+    ):
         sampling.check_reducible(robot)
         monkeypatch.setattr(sampling, "_OF_MEDIUM", ("density",))
         refuses(InputError, "density is no stiffness", sampling.check_reducible, robot)
         monkeypatch.setattr(sampling, "_OF_MEDIUM", ())
         body, energies = robot.simulator.body, robot.simulator.body.energies
-        monkeypatch.setitem(vars(body), "energies", [*energies, Contact({"floor": HalfSpace(position=(0, 0, -9))})])
+        monkeypatch.setitem(
+            vars(body), "energies", [*energies, Contact({"floor": HalfSpace(position=(0, 0, -9))})]
+        )
         refuses(InputError, "in contact cannot be reduced", sampling.check_reducible, robot)
         monkeypatch.setitem(vars(body), "energies", [*energies, SimpleNamespace(memory=("slide",))])
         refuses(InputError, "with memory", sampling.check_reducible, robot)
-        refuses(InputError, "no stiffness", reduce, warp_resphys.load(folder, "simfree"), ReductionSettings())
+        refuses(
+            InputError,
+            "no stiffness",
+            reduce,
+            warp_resphys.load(folder, "simfree"),
+            ReductionSettings(),
+        )
 
     def test_a_path_out_of_reach_is_named_with_the_nearest_point(self, folder, model, robot):
         far = control_of(folder).changed(centre=[0.0, 0.0, -0.35])
         task = Task(far, robot)
-        refuses(InputError, r"path circle: .*-350.0\) mm is .* mm away", task.check_reach, model, 1e-3)
+        refuses(
+            InputError, r"path circle: .*-350.0\) mm is .* mm away", task.check_reach, model, 1e-3
+        )
 
 
 class TestReducedTwin:
@@ -194,9 +228,16 @@ class TestReducedTwin:
     @pytest.fixture(scope="class")
     @classmethod
     def swing(cls, corrected):
-        """Markers (T + 1, M, 3) of the robot, let go from a push while its tendons are commanded."""
+        """Markers (T + 1, M, 3) of the robot, let go from a push
+        while its tendons are commanded.
+        """
         rest = corrected.simulator.rest_positions
-        push = 0.02 * torch.tensor([0.6, 0.8, 0.0]).to(rest) * (rest[:, 2:] < rest[:, 2].mean()) / len(rest)
+        push = (
+            0.02
+            * torch.tensor([0.6, 0.8, 0.0]).to(rest)
+            * (rest[:, 2:] < rest[:, 2].mean())
+            / len(rest)
+        )
         start = corrected.settle(tendon_tension=cls.commands, external_force=push)
         motion = corrected.rollout(start, 60, tendon_tension=cls.commands).markers[:, 0].numpy()
         return motion + cls.noise * np.random.default_rng(0).standard_normal(motion.shape)
@@ -214,27 +255,41 @@ class TestReducedTwin:
         seen, last = corrected.observe(now.state)[0].numpy(), len(swing) * corrected.time_step
         places = twin._belief_at(twin._update()).places
         assert np.abs(seen + places - now.markers).max() < 1e-3
-        stepped = corrected.observe(corrected.step(now.state, tendon_tension=self.commands))[0].numpy()
+        stepped = corrected.observe(corrected.step(now.state, tendon_tension=self.commands))[
+            0
+        ].numpy()
         twin.take(last, tendon_tension=self.commands)
         moved = np.abs(twin.now.markers - now.markers).max()
         assert np.abs(stepped - seen - (twin.now.markers - now.markers)).max() < 0.6 * moved
 
     def test_it_is_a_setting(self, folder):
         settings = TwinSettings(
-            horizon=0.1, patience=0.3, align=False, refine={}, noise=2e-4, planned=True, engine="reduced"
+            horizon=0.1,
+            patience=0.3,
+            align=False,
+            refine={},
+            noise=2e-4,
+            planned=True,
+            engine="reduced",
         )
         twin = settings.twin(warp_resphys.load(folder, "resphys"))
         assert isinstance(twin.estimator, ReducedEstimator)
-        assert ", resphys, by its reduced model: steps of 10 ms, predictions 0.1 s ahead, no packet yet" in repr(twin)
+        assert (
+            ", resphys, by its reduced model: steps of 10 ms, predictions 0.1 s ahead, no packet "
+            "yet" in repr(twin)
+        )
         with pytest.raises(InputError, match="no youngs_modulus to refine"):
             settings.changed(refine={"youngs_modulus": 1e3}).twin(twin.estimator.robot)
-        with pytest.raises(InputError, match=r"robot is '.*': give the robot of a run, as warp_resphys\.load"):
+        with pytest.raises(
+            InputError, match=r"robot is '.*': give the robot of a run, as warp_resphys\.load"
+        ):
             Twin(str(folder), "reduced")
 
 
 class TestPlans:
     def test_plans_stay_within_bounds_and_rates(self, folder):
-        plan, limits = read_motion(folder / plans_file("resphys"), PLANNED, "circle_0.4s"), control_of(folder).limits
+        plan = read_motion(folder / plans_file("resphys"), PLANNED, "circle_0.4s")
+        limits = control_of(folder).limits
         assert plan["inputs"].min() > limits.low - 1e-3
         assert plan["inputs"].max() < limits.high + 1e-3
         assert plan["inputs"].max() > 0.1
@@ -253,7 +308,9 @@ class TestDriving:
         names = ["open_sysid", "open_resphys", "receding_resphys", "receding_linear", "feedback_5"]
         assert list(tracking) == controllers_of(control_of(folder)) == names
         with read_hdf5(folder / "driven.h5", "driven") as file:
-            path, points, inputs = (read_array(file, f"circle_0.4s/{key}") for key in ("path", "points", "inputs"))
+            path, points, inputs = (
+                read_array(file, f"circle_0.4s/{key}") for key in ("path", "points", "inputs")
+            )
         for row, name in enumerate(names):
             wanted = 1e3 * np.linalg.norm(points[row] - path, axis=1).mean()
             assert tracking[name]["mean_mm"] == pytest.approx(wanted)
@@ -291,14 +348,19 @@ class TestDriving:
             (["motion=square_1s"], "motion names square_1s"),
             (["motion=circle_0.4s", "controllers=[me]"], "controllers names me"),
             (["motion=circle_0.4s", "controllers=[a,b,c,d]"], "controllers names 4"),
-            (["motion=circle_0.4s", "trial=t000"], "trial is for films of trials, and motion for films of control: "),
+            (
+                ["motion=circle_0.4s", "trial=t000"],
+                "trial is for films of trials, and motion for films of control: ",
+            ),
             (["controllers=[open_sysid]"], "controllers drive motions"),
         ],
     )
     def test_invalid_options_of_a_film_are_refused(self, folder, change, said):
         assert said in sentence("view", "film", f"run={folder}", *change)
 
-    def test_a_new_horizon_drives_again_but_plans_nothing_again(self, folder, monkeypatch, no_report):
+    def test_a_new_horizon_drives_again_but_plans_nothing_again(
+        self, folder, monkeypatch, no_report
+    ):
         monkeypatch.chdir(folder.parent)
         record = folder / "stages" / "plan_resphys.json"
         before, driven = record.stat().st_mtime_ns, []

@@ -1,4 +1,6 @@
-"""Paths, polynomials, quadratic programs, the response of inputs, reduced models, and control without a simulator."""
+"""Paths, polynomials, quadratic programs, the response of inputs,
+reduced models, and control without a simulator.
+"""
 
 import sys
 from dataclasses import replace
@@ -74,7 +76,13 @@ def program(target, rows, least, most, high):
     """The point nearest to a target, between zero and upper bounds, with one linear constraint."""
     target = np.array(target)
     return solve_program(
-        np.eye(len(target)), -target, np.array([rows]), np.array([least]), np.array([most]), 0.0 * target, high
+        np.eye(len(target)),
+        -target,
+        np.array([rows]),
+        np.array([least]),
+        np.array([most]),
+        0.0 * target,
+        high,
     )
 
 
@@ -91,7 +99,9 @@ class TestPrograms:
 
     def test_points_are_means_of_markers(self):
         markers = np.arange(9.0).reshape(3, 3)
-        np.testing.assert_allclose(tracked_of("abc", ["a", "c"]) @ markers.ravel(), markers[[0, 2]].mean(0))
+        np.testing.assert_allclose(
+            tracked_of("abc", ["a", "c"]) @ markers.ravel(), markers[[0, 2]].mean(0)
+        )
         refuses(InputError, "tracked names d: choose from a, b, c", tracked_of, "abc", ["d"])
 
     def test_a_plan_keeps_out_of_inputs_for_which_the_model_diverges(self):
@@ -103,18 +113,28 @@ class TestPrograms:
             def respond(self, start, inputs, bias):
                 return np.where(inputs > 0.6, np.nan, inputs)
 
-        planner = Planner(Model(), np.eye(1), LimitsOfInputs(low=0.0, high=1.0, rate=100.0), np.ones((4, 1)), 4, 1)
-        np.testing.assert_allclose(planner.plan(0, None)[-1], 0.5, rtol=0.1)  # half of the whole step
+        planner = Planner(
+            Model(), np.eye(1), LimitsOfInputs(low=0.0, high=1.0, rate=100.0), np.ones((4, 1)), 4, 1
+        )
+        # Half of the whole step.
+        np.testing.assert_allclose(planner.plan(0, None)[-1], 0.5, rtol=0.1)
 
 
 @pytest.mark.parametrize(("activation", "blocks"), [("silu", 1), ("normalised_elu", 3)])
 def test_the_evaluator_is_the_network(activation, blocks):
     torch.manual_seed(0)
     samples = torch.randn(20, 4, 3, dtype=torch.float64)
-    config = {"kind": "reduced", "position_modes": 3, "velocity_modes": 2, "force_modes": 5, "blocks": blocks,
-              "layers": 2, "width": 16, "activation": activation}  # fmt: skip
+    modes = {"position_modes": 3, "velocity_modes": 2, "force_modes": 5}
+    layers = {"blocks": blocks, "layers": 2, "width": 16, "activation": activation}
+    config = {"kind": "reduced", **modes, **layers}
     network = build_model(
-        ResidualForce, NetworkSettings(**config), samples[0], samples, samples, samples, samples[:, 0]
+        ResidualForce,
+        NetworkSettings(**config),
+        samples[0],
+        samples,
+        samples,
+        samples,
+        samples[:, 0],
     ).double()
     network.fit_linear(torch.randn(40, 8), torch.randn(40, 5), 0.1)
     inputs = 3.0 * torch.randn(7, 8, dtype=torch.float64)
@@ -131,7 +151,9 @@ def test_the_evaluator_is_the_network(activation, blocks):
     outputs, left = Evaluator(network, fading)(inputs.numpy())
     np.testing.assert_array_equal(left, range_.excludes(inputs))
     np.testing.assert_allclose(outputs, network.encode_outputs(force).detach().numpy(), atol=1e-12)
-    np.testing.assert_allclose(outputs, fading.outputs(network, inputs).detach().numpy(), atol=1e-12)
+    np.testing.assert_allclose(
+        outputs, fading.outputs(network, inputs).detach().numpy(), atol=1e-12
+    )
 
 
 def driven_line(steps, random, matrices):
@@ -148,7 +170,10 @@ def driven_line(steps, random, matrices):
 class TestBaselines:
     @pytest.fixture(scope="class")
     def fitted(self):
-        """A model of four trials, the last for validation; a path; and the error of a plan for any path."""
+        """A model of four trials, the last for validation; a path.
+
+        And the error of a plan for any path.
+        """
         random = np.random.default_rng(3)
         turn = 0.97 * np.array([[np.cos(0.2), np.sin(0.2)], [-np.sin(0.2), np.cos(0.2)]])
         matrices = turn, np.array([[0.0], [0.01]]), random.standard_normal((6, 2))
@@ -171,7 +196,9 @@ class TestBaselines:
     def test_points_are_free_where_the_path_is_nan(self, fitted):
         _, path, error = fitted
         free = np.arange(30) < 15
-        without, held = (error(np.where(free[:, None], value, path))[~free] for value in (np.nan, 0.1))
+        without, held = (
+            error(np.where(free[:, None], value, path))[~free] for value in (np.nan, 0.1)
+        )
         assert without.max() < 0.2 * held.max()
 
     def test_feedback_finds_a_place_that_its_jacobian_gets_wrong(self):
@@ -180,7 +207,9 @@ class TestBaselines:
         limits = LimitsOfInputs(low=0.0, high=10.0, rate=100.0)
         goal, command = np.array([5e-3, 8e-3, 0.0]), np.zeros(3)
         tracked = np.eye(2, 3)
-        feedback = JacobianFeedback(wrong, limits, 5.0, 0.01, tracked, np.tile(goal[:2], (300, 1)), np.zeros((1, 3)))
+        feedback = JacobianFeedback(
+            wrong, limits, 5.0, 0.01, tracked, np.tile(goal[:2], (300, 1)), np.zeros((1, 3))
+        )
         for number in range(300):
             command = feedback(number, np.append(true @ command, 0.0)[None])
             assert (command >= 0.0).all()
@@ -189,8 +218,16 @@ class TestBaselines:
 
 
 MODES, PARTS, POINTS, FILTERS, VERTICES = 3, 2, 2, (0.1, 0.5), 4
-NETWORK = {"kind": "reduced", "position_modes": 4, "velocity_modes": 2, "force_modes": 3, "blocks": 1, "layers": 1,
-           "width": 8, "activation": "silu"}  # fmt: skip
+NETWORK = {
+    "kind": "reduced",
+    "position_modes": 4,
+    "velocity_modes": 2,
+    "force_modes": 3,
+    "blocks": 1,
+    "layers": 1,
+    "width": 8,
+    "activation": "silu",
+}
 
 
 @pytest.fixture(scope="module", params=["implicit_euler", "bdf2"])
@@ -200,17 +237,28 @@ def model(request):
     torch.manual_seed(0)
 
     def polynomial(order, middle, spread):
-        coefficients = spread * random.standard_normal((len(powers(PARTS, order)), *np.shape(middle)))
+        coefficients = spread * random.standard_normal(
+            (len(powers(PARTS, order)), *np.shape(middle))
+        )
         coefficients[0] += middle
         return Polynomial(coefficients, order)
 
     conditions = torch.randn(20, PARTS * (1 + len(FILTERS)), dtype=torch.float64)
     samples = torch.randn(20, 6, 3, dtype=torch.float64)
-    network = build_model(ResidualForce, NetworkSettings(**NETWORK), samples[0], samples, samples, samples, conditions)
+    network = build_model(
+        ResidualForce, NetworkSettings(**NETWORK), samples[0], samples, samples, samples, conditions
+    )
     network = network.double().requires_grad_(False)
-    missed, times = (torch.ones(1, 2, dtype=torch.float64), (0.02, 0.3)) if request.param == "bdf2" else (None, ())
+    missed, times = (
+        (torch.ones(1, 2, dtype=torch.float64), (0.02, 0.3))
+        if request.param == "bdf2"
+        else (None, ())
+    )
     seen = np.zeros((6, 2 * MODES))
-    seen[:4, :MODES], seen[4:, MODES:] = random.standard_normal((4, MODES)), random.standard_normal((2, MODES))
+    seen[:4, :MODES], seen[4:, MODES:] = (
+        random.standard_normal((4, MODES)),
+        random.standard_normal((2, MODES)),
+    )
     force = ReducedForce(
         network,
         Range.of(torch.randn(30, 6 + conditions.shape[1], dtype=torch.float64), missed),
@@ -222,7 +270,8 @@ def model(request):
         polynomial(2, random.standard_normal((MODES, 3)), 0.1),
     )
     curved = random.standard_normal((MODES, MODES, 3 * POINTS))
-    damping, branches = polynomial(2, np.eye(MODES), 0.1), polynomial(2, np.tile(10.0 * np.eye(MODES), (2, 1, 1)), 0.5)
+    damping = polynomial(2, np.eye(MODES), 0.1)
+    branches = polynomial(2, np.tile(10.0 * np.eye(MODES), (2, 1, 1)), 0.5)
     acts = {"factor": 0.8, "delay": 0.013, "rise": 0.03}
     return ReducedModel(
         0.01,
@@ -255,7 +304,9 @@ def test_an_equilibrium_lasts(model):
     state = model.rest(np.array([3.0, 1.5]), count=2)
     end = model.move(state, np.tile([3.0, 1.5], (20, 2, 1)))[2]
     np.testing.assert_allclose(end.z, state.z, atol=1e-6)
-    np.testing.assert_allclose(model.observe(end)[0], model.rest_observed(np.array([[3.0, 1.5]]))[0], atol=1e-5)
+    np.testing.assert_allclose(
+        model.observe(end)[0], model.rest_observed(np.array([[3.0, 1.5]]))[0], atol=1e-5
+    )
 
 
 def test_a_transition_of_states_that_are_moved_with_their_past_is_linearised(model):
@@ -269,17 +320,25 @@ def test_a_transition_of_states_that_are_moved_with_their_past_is_linearised(mod
 
         def after(x, number=number):
             z, v, b = (x * way * (np.arange(3) == number)[:, None])[:, None]
-            state = model.move(start.select([0]).moved(z, v, model.time_step), inputs[None, None], bias[0] + b)[2]
+            state = model.move(
+                start.select([0]).moved(z, v, model.time_step), inputs[None, None], bias[0] + b
+            )[2]
             return float(weights @ np.concatenate([state.z[0], state.v[0]]))
 
         difference, doubt = central_difference(after)
-        assert abs(weights @ slope @ way[number] - difference) < 1e-3 * abs(difference) + 10.0 * doubt
-    np.testing.assert_allclose(end.z[1], model.step(start, np.tile(inputs, (2, 1))).z[1], atol=1e-12)
+        assert (
+            abs(weights @ slope @ way[number] - difference) < 1e-3 * abs(difference) + 10.0 * doubt
+        )
+    np.testing.assert_allclose(
+        end.z[1], model.step(start, np.tile(inputs, (2, 1))).z[1], atol=1e-12
+    )
 
 
 def test_a_command_that_never_varies_changes_nothing(model):
     random = np.random.default_rng(8)
-    more = replace(model, scale=np.full(PARTS + 1, 5.0), range=np.array([[0.0, 0.7, 0.0], [5.0, 0.7, 5.0]]))
+    more = replace(
+        model, scale=np.full(PARTS + 1, 5.0), range=np.array([[0.0, 0.7, 0.0], [5.0, 0.7, 5.0]])
+    )
     inputs = 5.0 * random.random((6, 2, PARTS))
     whole = np.insert(inputs, 1, random.random(2), axis=2)
     one = model.respond(model.rest(inputs[0, 0]), inputs)
@@ -292,13 +351,16 @@ def test_a_command_that_never_varies_changes_nothing(model):
 @pytest.mark.parametrize(("true", "least", "best"), [(5, 3, 5), (2, 3, 3)])
 def test_the_order_is_the_one_that_predicts_other_samples(true, least, best):
     random = np.random.default_rng(9)
-    points, coefficients = random.uniform(-1.0, 1.0, (200, 2)), random.standard_normal((len(powers(2, true)), 4))
+    points = random.uniform(-1.0, 1.0, (200, 2))
+    coefficients = random.standard_normal((len(powers(2, true)), 4))
     values = Polynomial(coefficients, true)(points) + 1e-3 * random.standard_normal((200, 4))
     assert best_order(points, values, least) == best
 
 
 def test_a_branch_relaxes_as_a_maxwell_element(model):
-    """Coordinates that are moved at once and stay there: what has not relaxed decays with the branch's time."""
+    """Coordinates that are moved at once and stay there:
+    what has not relaxed decays with the branch's time.
+    """
     strains, change = np.zeros((len(model.times), 1, MODES)), np.ones((1, MODES))
     strains = model.relaxed(strains + change, 0.0 * change)
     for _ in range(9):
@@ -310,7 +372,9 @@ def test_a_branch_relaxes_as_a_maxwell_element(model):
 def test_squares_of_polynomials_have_no_negative_eigenvalues():
     random = np.random.default_rng(7)
     points, roots = random.uniform(-1.0, 1.0, (60, 2)), 0.3 * random.standard_normal((6, 3, 3))
-    true = SquaredPolynomial(roots + roots.swapaxes(1, 2) + 9.0 * np.eye(3) * (np.arange(6) == 0)[:, None, None], 2)
+    true = SquaredPolynomial(
+        roots + roots.swapaxes(1, 2) + 9.0 * np.eye(3) * (np.arange(6) == 0)[:, None, None], 2
+    )
     again = SquaredPolynomial.fitted(points, true(points), 2)
     np.testing.assert_allclose(again(points), true(points), rtol=1e-5, atol=1e-5)
     assert np.linalg.eigvalsh(again(10.0 * points)).min() > -1e-6

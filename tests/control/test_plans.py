@@ -1,4 +1,6 @@
-"""Plans for a small rod whose tensions do not follow their commands, and reduced models that know it."""
+"""Plans for a small rod whose tensions do not follow their commands,
+and reduced models that know it.
+"""
 
 from dataclasses import replace
 
@@ -20,12 +22,20 @@ from warp_resphys.settings.control import ReductionSettings
 
 ELASTIC = ["~laboratory.material.prony_ratio_1", "~laboratory.material.prony_time_1"]
 BODY = [*ROD, "laboratory.mesh.nodes=8", "laboratory.time_step=0.01", *ELASTIC]
-RUN = ["experiment=tendon_rod_control", *DRIVEN, *BODY, "control.shapes=[circle]", "control.size=0.02"]
+RUN = [
+    "experiment=tendon_rod_control",
+    *DRIVEN,
+    *BODY,
+    "control.shapes=[circle]",
+    "control.size=0.02",
+]
 LIMIT = 1.5  # N
 
 
 def actuator(gain, creep, coupling=0.0):
-    """A network that adds shares of each tension, of its mean over 0.3 s, and of the other tensions."""
+    """A network that adds shares of each tension, of its mean over 0.3 s,
+    and of the other tensions.
+    """
     own = torch.eye(3, dtype=torch.float64)
     shares = torch.cat([gain * own + coupling * (1.0 - own), creep * own], 1)
     return {"tendon_tension": network_of(lambda values: values @ shares.T, LIMIT, 3, (0.3,))}
@@ -35,7 +45,11 @@ def actuator(gain, creep, coupling=0.0):
 def robot():
     """A rod with 0.7 of each commanded tension at once, and more of it in time."""
     seen = {"tendon_tension": ((0.0,) * 3, (LIMIT,) * 3)}
-    return Robot(replace(laboratory_robot(settings(*RUN)).description, seen=seen, actuator=actuator(-0.3, 0.15)))
+    return Robot(
+        replace(
+            laboratory_robot(settings(*RUN)).description, seen=seen, actuator=actuator(-0.3, 0.15)
+        )
+    )
 
 
 @pytest.fixture(scope="module")
@@ -59,12 +73,16 @@ def path(task, model):
 
 def acting(model, **response):
     """The model under another response of the tensions to the commands."""
-    return replace(model, acts={word: x for word, x in model.acts.items() if word != "network"} | response)
+    return replace(
+        model, acts={word: x for word, x in model.acts.items() if word != "network"} | response
+    )
 
 
 def test_a_plan_through_the_actuator_is_followed_by_the_robot(robot, model, task, path):
     def errors(model, corrections):
-        (motion,) = plan.follow(robot, model, lambda path: task.planner(model, path), path[None], corrections)
+        (motion,) = plan.follow(
+            robot, model, lambda path: task.planner(model, path), path[None], corrections
+        )
         return motion["errors_mm"]
 
     through, corrected = errors(model, 1)
@@ -75,7 +93,8 @@ def test_a_plan_through_the_actuator_is_followed_by_the_robot(robot, model, task
 @pytest.mark.parametrize(
     ("response", "most"),
     [
-        ({"network": actuator(-0.1, 0.1, -0.2)["tendon_tension"]}, 0.3),  # tendons slacken the others down to zero
+        # Tendons slacken the others down to zero.
+        ({"network": actuator(-0.1, 0.1, -0.2)["tendon_tension"]}, 0.3),
         ({"slew": 0.5}, 2.0),
         ({"slope_1": 0.3, "slope_2": 2.0, "slope_3": 0.5, "typical": 1.0}, 0.6),
     ],
@@ -89,7 +108,9 @@ def test_a_response_with_kinks_is_planned_with(model, task, path, response, most
 
 
 def test_a_robot_with_another_actuator_has_another_reduced_model(robot, model):
-    again, other = (Robot(replace(robot.description, actuator=actuator(-0.3, creep))) for creep in (0.15, 0.2))
+    again, other = (
+        Robot(replace(robot.description, actuator=actuator(-0.3, creep))) for creep in (0.15, 0.2)
+    )
     assert fingerprint(again) == model.robot
     assert fingerprint(other) != model.robot
 

@@ -9,7 +9,10 @@ mujoco = pytest.importorskip("mujoco", reason="the extra mujoco is not installed
 
 GEOMS = {
     "sphere": ("0.03", lambda x: np.linalg.norm(x, axis=1) - 0.03),
-    "capsule": ("0.02 0.05", lambda x: np.linalg.norm(x - np.clip(x, [0, 0, -0.05], [0, 0, 0.05]), axis=1) - 0.02),
+    "capsule": (
+        "0.02 0.05",
+        lambda x: np.linalg.norm(x - np.clip(x, [0, 0, -0.05], [0, 0, 0.05]), axis=1) - 0.02,
+    ),
     "cylinder": (
         "0.02 0.05",
         lambda x: np.maximum(np.linalg.norm(x[:, :2], axis=1) / 0.02, np.abs(x[:, 2]) / 0.05) - 1.0,
@@ -22,8 +25,9 @@ GEOMS = {
 def test_a_surface_is_on_its_geom(kind):
     size, distance = GEOMS[kind]
     model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><worldbody><geom type="plane" size="1 1 1"/><body pos=".3 -.1 .2" euler="20 40 60"><freejoint/>'
-        f'<geom type="{kind}" size="{size}" pos=".1 0 0"/></body></worldbody></mujoco>'
+        '<mujoco><worldbody><geom type="plane" size="1 1 1"/><body pos=".3 -.1 .2" euler="20 40 '
+        f'60"><freejoint/><geom type="{kind}" size="{size}" pos=".1 0 '
+        '0"/></body></worldbody></mujoco>'
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

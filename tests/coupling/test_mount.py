@@ -1,4 +1,6 @@
-"""Robots on bodies of MuJoCo models: rigid bodies, heavy robots, momentum, statics, batches, scenes, refusals."""
+"""Robots on bodies of MuJoCo models: rigid bodies, heavy robots,
+momentum, statics, batches, scenes, refusals.
+"""
 
 import re
 from functools import cache
@@ -27,7 +29,8 @@ from warp_resphys.coupling.mount import _WEIGHTS  # noqa: E402
 
 SIZE, DIVISIONS, MASS = (0.1, 0.02, 0.02), (3, 1, 1), 0.04  # m, cells, kg
 STIFF, SOFT = 1e8, 2e5  # Pa
-pytestmark = pytest.mark.filterwarnings("ignore::warp_resphys.ResphysWarning")  # too stiff, too few cells
+# Too stiff, too few cells.
+pytestmark = pytest.mark.filterwarnings("ignore::warp_resphys.ResphysWarning")
 SLIDE = '<joint name="joint" type="slide" axis="1 0 0" stiffness="{stiffness}"/>'
 HINGE = '<joint name="joint" type="hinge" axis="0 1 0"/>'
 HANGING = np.pi / 2 + np.arctan(0.2)  # angle of the hinge with the middle of the beam below it
@@ -48,15 +51,18 @@ def beam(time_step=0.005, youngs_modulus=SOFT, gravity=-9.81, damping=0.0, on_fa
         "simulation.mass_damping=0",
     )
     own = MaterialSettings.model_validate({**run.simulation.plain(), "model": "corotated"})
-    made = Description("beam", "sysid", SimulatorSettings.of(run), own, box_hexahedra(SIZE, DIVISIONS))
+    made = Description(
+        "beam", "sysid", SimulatorSettings.of(run), own, box_hexahedra(SIZE, DIVISIONS)
+    )
     return Robot(made, on_failure=on_failure)
 
 
 def model(joint, time_step=0.005, mass=0.04, gravity=-9.81, inside="", outside=""):
     """A box on a joint."""
     return mujoco.MjModel.from_xml_string(
-        f'<mujoco><option timestep="{time_step}" gravity="0 0 {gravity}"/><worldbody><body name="box">{joint}'
-        f'<geom type="sphere" size=".01" mass="{mass}" contype="0"/>{inside}</body></worldbody>{outside}</mujoco>'
+        f'<mujoco><option timestep="{time_step}" gravity="0 0 {gravity}"/><worldbody><body '
+        f'name="box">{joint}<geom type="sphere" size=".01" mass="{mass}" '
+        f'contype="0"/>{inside}</body></worldbody>{outside}</mujoco>'
     )
 
 
@@ -65,11 +71,12 @@ def rigid(robot):
     mass, x = robot.constants.mass[0].numpy(), robot.simulator.rest_positions.numpy()
     middle = mass @ x / mass.sum()
     arm = x - middle
-    full = ((arm**2).sum(1)[:, None, None] * np.eye(3) - arm[:, :, None] * arm[:, None]) * mass[:, None, None]
+    shape = (arm**2).sum(1)[:, None, None] * np.eye(3) - arm[:, :, None] * arm[:, None]
+    full = shape * mass[:, None, None]
     xx, yy, zz, xy, xz, yz = full.sum(0)[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     return (
-        f'<body name="beam"><inertial pos="{middle[0]} {middle[1]} {middle[2]}" mass="{mass.sum()}" '
-        f'fullinertia="{xx} {yy} {zz} {xy} {xz} {yz}"/></body>'
+        f'<body name="beam"><inertial pos="{middle[0]} {middle[1]} {middle[2]}" '
+        f'mass="{mass.sum()}" fullinertia="{xx} {yy} {zz} {xy} {xz} {yz}"/></body>'
     )
 
 
@@ -82,7 +89,9 @@ def at(model, *positions):
 
 
 def swing(joint, start, about, time_step, substeps, mass, seconds):
-    """Joint positions and forces along x of a stiff robot, and those of MuJoCo's rigid body with tiny steps."""
+    """Joint positions and forces along x of a stiff robot,
+    and those of MuJoCo's rigid body with tiny steps.
+    """
     robot = beam(time_step, STIFF)
     mount = Mount(robot, model(joint, time_step / substeps, mass), "box")
     state = mount.begin(at(mount.model, about + start))
@@ -115,16 +124,23 @@ def period(positions, time_step):
     ids=["slide, light", "hinge", "hinge, heavy"],
 )
 def test_a_stiff_robot_swings_like_a_rigid_body(joint, start, about, substeps, mass):
-    """Period, and reaction over motion, to 1 % at 5 ms; the error of the motion is proportional to the step.
+    """Period, and reaction over motion, to 1 % at 5 ms.
 
-    Implicit Euler damps the turning of the robot itself, so the reactions are those of a smaller swing.
+    The error of the motion is proportional to the step.
+
+    Implicit Euler damps the turning of the robot itself, so the reactions are those of a smaller
+    swing.
     """
     errors = []
     for time_step in (0.01, 0.005):
-        ours, theirs, force, wanted = swing(joint, start, about, time_step, substeps, mass, 0.4 if mass < 0.01 else 0.8)
+        ours, theirs, force, wanted = swing(
+            joint, start, about, time_step, substeps, mass, 0.4 if mass < 0.01 else 0.8
+        )
         errors.append(np.abs(ours - theirs).max())
     assert period(ours, 0.005) == pytest.approx(period(theirs, 0.005), rel=5e-3)
-    assert np.ptp(force[10:]) / np.ptp(ours[10:]) == pytest.approx(np.ptp(wanted[10:]) / np.ptp(theirs[10:]), rel=1e-2)
+    assert np.ptp(force[10:]) / np.ptp(ours[10:]) == pytest.approx(
+        np.ptp(wanted[10:]) / np.ptp(theirs[10:]), rel=1e-2
+    )
     assert errors[1] < 0.65 * errors[0]
     assert errors[1] < 0.25 * start
 
@@ -143,7 +159,9 @@ def kicked(ratio, youngs_modulus, steps, robot=None):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ratio", "youngs_modulus"), [(0.1, 3e4), (0.1, 3e6), (1.0, 3e5), (10.0, 3e4), (10.0, 3e6)])
+@pytest.mark.parametrize(
+    ("ratio", "youngs_modulus"), [(0.1, 3e4), (0.1, 3e6), (1.0, 3e5), (10.0, 3e4), (10.0, 3e6)]
+)
 def test_robots_without_damping_are_stable_at_all_ratios_of_mass(ratio, youngs_modulus):
     twists = kicked(ratio, youngs_modulus, 300)
     assert twists[150:].max() < 1.05 * twists[:150].max()
@@ -165,7 +183,8 @@ def test_a_heavy_robot_is_stable_with_its_response_and_diverges_without(monkeypa
 
 
 @pytest.mark.parametrize(
-    ("ratio", "seconds"), [pytest.param(0.5, 0.6), *(pytest.param(r, 2.2, marks=pytest.mark.slow) for r in (0.1, 5.0))]
+    ("ratio", "seconds"),
+    [pytest.param(0.5, 0.6), *(pytest.param(r, 2.2, marks=pytest.mark.slow) for r in (0.1, 5.0))],
 )
 def test_a_free_body_and_its_robot_keep_their_momentum(ratio, seconds):
     robot = beam(0.005, SOFT, 0, 5e-3)
@@ -178,22 +197,31 @@ def test_a_free_body_and_its_robot_keep_their_momentum(ratio, seconds):
         state, impulse = mount.step(state, external_force=force), impulse + 0.005 * force.sum(0)
         arm = mount.data(state)
         mujoco.mj_subtreeVel(mount.model, arm)
-        whole = mount.model.body_subtreemass[0] * arm.subtree_linvel[0] + mass @ state.robot.v[0].numpy()
+        whole = (
+            mount.model.body_subtreemass[0] * arm.subtree_linvel[0]
+            + mass @ state.robot.v[0].numpy()
+        )
         errors.append(np.linalg.norm(whole - impulse))
-    assert np.linalg.norm(mass @ state.robot.v[0].numpy() - impulse) > 0.05 * np.linalg.norm(impulse)
+    assert np.linalg.norm(mass @ state.robot.v[0].numpy() - impulse) > 0.05 * np.linalg.norm(
+        impulse
+    )
     assert max(errors[42:]) < 1e-2 * np.linalg.norm(impulse)
 
 
 ARM = (
-    '<mujoco><option timestep=".005" gravity="0 0 -9.81"/><worldbody><body name="upper"><joint name="one" axis="0 1 0" '
-    'damping="4"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass=".5"/><body name="flange" pos=".3 0 0">'
-    '<joint name="two" axis="0 1 0" damping="4"/><geom type="sphere" size=".02" pos=".05 0 0" mass=".1"/></body>'
-    '</body></worldbody><actuator><position joint="one" kp="200"/><position joint="two" kp="200"/></actuator></mujoco>'
+    '<mujoco><option timestep=".005" gravity="0 0 -9.81"/><worldbody><body name="upper"><joint '
+    'name="one" axis="0 1 0" damping="4"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" '
+    'mass=".5"/><body name="flange" pos=".3 0 0"><joint name="two" axis="0 1 0" '
+    'damping="4"/><geom type="sphere" size=".02" pos=".05 0 0" '
+    'mass=".1"/></body></body></worldbody><actuator><position joint="one" kp="200"/><position '
+    'joint="two" kp="200"/></actuator></mujoco>'
 )
 
 
 def held(robot, pose, angles):
-    """An arm that holds a robot: the mount, its state after a second, and the torques of statics at the joints."""
+    """An arm that holds a robot: the mount, its state after a second,
+    and the torques of statics at the joints.
+    """
     mount = Mount(robot, mujoco.MjModel.from_xml_string(ARM), "flange", pose)
     data = at(mount.model, *angles)
     data.ctrl[:] = angles
@@ -203,7 +231,8 @@ def held(robot, pose, angles):
     data = mount.data(state)
     weights = robot.simulator.prepare().load_mass[0].numpy() * 9.81
     arms = state.robot.q[0].numpy()[:, :1] - data.xanchor[:, 0]
-    return mount, state, data.qfrc_bias - weights @ arms  # about y, a weight at x turns by x times it
+    # About y, a weight at x turns by x times it.
+    return mount, state, data.qfrc_bias - weights @ arms
 
 
 def test_the_joints_of_an_arm_at_rest_hold_it_and_the_robot():
@@ -225,7 +254,10 @@ def test_a_batch_moves_as_its_arms_do_alone():
         alone = [mount.step(one, external_force=own) for one, own in zip(alone, force, strict=True)]
     for name in ("arm", "pose", "wrench"):
         np.testing.assert_allclose(
-            getattr(both, name), np.concatenate([getattr(one, name) for one in alone]), rtol=1e-6, atol=1e-7
+            getattr(both, name),
+            np.concatenate([getattr(one, name) for one in alone]),
+            rtol=1e-6,
+            atol=1e-7,
         )
     start = mount.begin(starts)
     mixed = start.where(np.array([True, False]), both)
@@ -236,7 +268,8 @@ def test_a_batch_moves_as_its_arms_do_alone():
 def test_an_arm_goes_on_without_a_robot_that_is_lost():
     robot = beam(on_failure="count")
     mount = Mount(robot, model(HINGE, gravity=-9.81), "box")
-    state, thrown = mount.begin([at(mount.model, 0.3)] * 2), np.zeros((2, *robot.simulator.rest_positions.shape))
+    state = mount.begin([at(mount.model, 0.3)] * 2)
+    thrown = np.zeros((2, *robot.simulator.rest_positions.shape))
     thrown[1, -1] = 1e9
     state = mount.step(state, external_force=thrown)
     speed = state.velocity[1, 4]
@@ -261,7 +294,9 @@ def test_one_way_a_robot_follows_the_arm_in_one_line():
     frame = flange.xmat.reshape(3, 3)
     turned = np.empty(9)
     quaternion = np.empty(4)
-    mujoco.mju_axisAngle2Quat(quaternion, np.array(TURNED[3:]) / np.linalg.norm(TURNED[3:]), np.linalg.norm(TURNED[3:]))
+    mujoco.mju_axisAngle2Quat(
+        quaternion, np.array(TURNED[3:]) / np.linalg.norm(TURNED[3:]), np.linalg.norm(TURNED[3:])
+    )
     mujoco.mju_quat2Mat(turned, quaternion)
     rest, fixed = robot.simulator.rest_positions.numpy(), robot.simulator.fixed.numpy()
     wanted = (rest[fixed] @ turned.reshape(3, 3).T + TURNED[:3]) @ frame.T + flange.xpos
@@ -272,30 +307,51 @@ def test_robots_of_a_scene_move_together():
     """Two beams, one of them turned: twice the reaction of one, about an origin between them."""
     robot = beam()
     poses = {"left": (0.01, 0, 0, 0, 0, 0), "right": (-0.01, 0.02, 0, 0, 0, np.pi)}
-    scene = Mount(RobotScene({name: (robot, pose) for name, pose in poses.items()}), model(HINGE), "box", TURNED)
+    scene = Mount(
+        RobotScene({name: (robot, pose) for name, pose in poses.items()}),
+        model(HINGE),
+        "box",
+        TURNED,
+    )
     state = scene.begin(at(scene.model, 0.3))
     pairs = []
     for name in poses:
         scene_rest = scene.robot.state_of(state.robot, name)
         pairs.append(np.linalg.norm(scene_rest.q[0].diff(dim=0).numpy()))
-    assert pairs[0] == pytest.approx(np.linalg.norm(robot.simulator.rest_positions.diff(dim=0).numpy()), rel=0.05)
-    np.testing.assert_allclose(state.wrench[0, :3], [0.0, 0.0, -2 * MASS * 9.81], rtol=1e-6, atol=1e-6)
-    state = scene.step(state, left={"external_force": np.zeros(robot.simulator.rest_positions.shape)})
+    assert pairs[0] == pytest.approx(
+        np.linalg.norm(robot.simulator.rest_positions.diff(dim=0).numpy()), rel=0.05
+    )
+    np.testing.assert_allclose(
+        state.wrench[0, :3], [0.0, 0.0, -2 * MASS * 9.81], rtol=1e-6, atol=1e-6
+    )
+    state = scene.step(
+        state, left={"external_force": np.zeros(robot.simulator.rest_positions.shape)}
+    )
     ours = scene.robot.scene.vertex_slice("left")
     fixed = robot.simulator.fixed.numpy()
     pose = base_pose(scene.model, scene.data(state), "box", TURNED)
     wanted = robot.step(robot.begin(base=pose), base=pose).q[0, fixed].numpy()
     moved = state.robot.q[0, ours].numpy()[fixed]
-    assert np.linalg.norm(moved - wanted, axis=1) == pytest.approx(0.01, rel=1e-6)  # the shift of its pose
+    # The shift of its pose.
+    assert np.linalg.norm(moved - wanted, axis=1) == pytest.approx(0.01, rel=1e-6)
     refuses(InputError, "there is no robot 'top' in the scene", scene.step, state, top={})
 
 
 @pytest.mark.slow
 def test_an_arm_feels_the_ball_that_its_gripper_lifts():
-    """Two fingers close on a ball on a table, and the arm lifts it; then its torques are those of statics to 0.5 %."""
+    """Two fingers close on a ball on a table, and the arm lifts it.
+
+    Then its torques are those of statics to 0.5 %.
+    """
     run = settings("experiment=finger", "integrator=implicit_euler")
-    finger = Robot(Description("finger", "simulation", SimulatorSettings.of(run), run.simulation, build_mesh(run.mesh)))
-    gripper = pytest.importorskip("warp_resphys.environments.grippers", exc_type=ImportError).gripper
+    finger = Robot(
+        Description(
+            "finger", "simulation", SimulatorSettings.of(run), run.simulation, build_mesh(run.mesh)
+        )
+    )
+    gripper = pytest.importorskip(
+        "warp_resphys.environments.grippers", exc_type=ImportError
+    ).gripper
     scene, arm = gripper(finger), mujoco.MjModel.from_xml_string(ARM)
     arm.opt.timestep = 0.002  # a fifth of the gripper's
     arm.body("upper").pos[:] = -0.3, 0.0, 0.2
@@ -304,7 +360,9 @@ def test_an_arm_feels_the_ball_that_its_gripper_lifts():
     fingers = -state.wrench[0, 2]
     for number in range(110):
         pull, lift = min(number / 25, 1.0) * 2.0, min(max(number - 30, 0) / 50, 1.0) * 0.0667
-        state = mount.step(state, [-lift, lift], **{name: {"tendon_tension": pull} for name in scene.robots})
+        state = mount.step(
+            state, [-lift, lift], **{name: {"tendon_tension": pull} for name in scene.robots}
+        )
     q, data = state.robot.q[0].numpy(), mount.data(state)
     ball, weights = scene.scene.vertex_slice("ball"), scene.constants.load_mass[0].numpy() * 9.80709
     assert q[ball, 2].mean() > scene.simulator.rest_positions[ball, 2].mean() + 0.018
@@ -314,11 +372,13 @@ def test_an_arm_feels_the_ball_that_its_gripper_lifts():
 
 
 PUSHED = (
-    '<mujoco><option timestep="0.01" gravity="0 0 -9.81"/><worldbody><body name="arm"><joint name="j" axis="0 1 0" '
-    'damping="1"/><geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass=".3"/><body name="flange" pos=".2 0 0">'
-    '<geom type="sphere" size=".02" mass=".2"/><body name="tool" pos="0 0 .05" euler="0 0 90"/></body></body>'
-    '<body name="hand" mocap="true" pos="0 0 .5"><geom type="sphere" size=".01"/><body name="palm"/></body></worldbody>'
-    '<actuator><position joint="j" kp="60" kv="1"/></actuator></mujoco>'
+    '<mujoco><option timestep="0.01" gravity="0 0 -9.81"/><worldbody><body name="arm"><joint '
+    'name="j" axis="0 1 0" damping="1"/><geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" '
+    'mass=".3"/><body name="flange" pos=".2 0 0"><geom type="sphere" size=".02" mass=".2"/><body '
+    'name="tool" pos="0 0 .05" euler="0 0 90"/></body></body><body name="hand" mocap="true" '
+    'pos="0 0 .5"><geom type="sphere" size=".01"/><body '
+    'name="palm"/></body></worldbody><actuator><position joint="j" kp="60" '
+    'kv="1"/></actuator></mujoco>'
 )
 
 
@@ -330,7 +390,10 @@ def settled(mount, data, steps=130):
 
 
 def test_a_push_on_the_flange_acts_beside_the_robot():
-    """2 N upward at 0.2 m relieve the servo by 0.4 N m, 0.382 degrees; a moment of 0.3 N m about y loads it."""
+    """2 N upward at 0.2 m relieve the servo by 0.4 N m, 0.382 degrees.
+
+    A moment of 0.3 N m about y loads it.
+    """
     mount = Mount(beam(0.01, damping=0.02), mujoco.MjModel.from_xml_string(PUSHED), "flange")
     torques, angles, forces = [], [], []
     for force, moment in ((0.0, 0.0), (2.0, 0.0), (0.0, 0.3)):
@@ -346,7 +409,9 @@ def test_a_push_on_the_flange_acts_beside_the_robot():
 
 
 def test_a_robot_with_tilted_gravity_is_turned_by_the_tilt():
-    """As it was recorded: with the pull of its own frame, which is the model's on an upright body."""
+    """As it was recorded: with the pull of its own frame,
+    which is the model's on an upright body.
+    """
     pull = np.array([-0.281, 0.153, -9.802])
     level = beam(gravity=-np.linalg.norm(pull))
     robot = level.in_gravity(pull)
@@ -363,7 +428,14 @@ def test_a_robot_with_tilted_gravity_is_turned_by_the_tilt():
     np.testing.assert_allclose(moved, recorded.q[0], atol=1e-7)
     np.testing.assert_allclose(mount.robot.simulator.gravity, arm.opt.gravity, atol=1e-9)
     steep = level.in_gravity(np.linalg.norm(pull) * np.array([np.sin(0.2), 0.0, -np.cos(0.2)]))
-    refuses(InputError, "10 degrees apart at most, or mount robot.in_gravity", Mount, steep, arm, "flange")
+    refuses(
+        InputError,
+        "10 degrees apart at most, or mount robot.in_gravity",
+        Mount,
+        steep,
+        arm,
+        "flange",
+    )
     scene = RobotScene({"left": (robot, np.zeros(6))})
     refuses(InputError, "give the robots of the scene poses", Mount, scene, arm, "flange")
 
@@ -371,10 +443,14 @@ def test_a_robot_with_tilted_gravity_is_turned_by_the_tilt():
 def test_the_pose_of_a_base_is_that_of_the_positions_whatever_was_computed():
     arm = mujoco.MjModel.from_xml_string(ARM)
     data = mujoco.MjData(arm)
-    np.testing.assert_allclose(base_pose(arm, data, "flange", TURNED)[:3], [0.33, -0.02, 0.05], atol=1e-12)
+    np.testing.assert_allclose(
+        base_pose(arm, data, "flange", TURNED)[:3], [0.33, -0.02, 0.05], atol=1e-12
+    )
     mujoco.mj_forward(arm, data)
     data.qpos[:] = 0.2, -0.6
-    np.testing.assert_array_equal(base_pose(arm, data, "flange"), base_pose(arm, at(arm, 0.2, -0.6), "flange"))
+    np.testing.assert_array_equal(
+        base_pose(arm, data, "flange"), base_pose(arm, at(arm, 0.2, -0.6), "flange")
+    )
     assert data.xpos[arm.body("flange").id, 2] == 0.0  # the data are left as they were
 
 
@@ -382,22 +458,28 @@ def test_bodies_that_no_force_moves_or_without_mass_are_refused():
     robot, arm = beam(0.01), mujoco.MjModel.from_xml_string(PUSHED)
     refuses(InputError, "'hand' is a mocap body.*base_pose", Mount, robot, arm, "hand")
     refuses(InputError, "'palm' is a mocap body, or fixed to one", Mount, robot, arm, "palm")
-    with pytest.raises(InputError, match="'tool' has no mass: mount the robot on 'flange'") as caught:
+    with pytest.raises(
+        InputError, match="'tool' has no mass: mount the robot on 'flange'"
+    ) as caught:
         Mount(robot, arm, "tool", (0.01, 0, 0, 0, 0, 0))
     pose = [float(x) for x in re.search(r"pose \[(.*)\]", str(caught.value))[1].split(",")]
     np.testing.assert_allclose(pose, [0.0, 0.01, 0.05, 0.0, 0.0, np.pi / 2], atol=1e-5)
     Mount(robot, arm, "flange", pose)
     frame = (
-        '<link name="tool0"/><joint name="f" type="fixed"><parent link="tool"/><child link="tool0"/></joint></robot>'
+        '<link name="tool0"/><joint name="f" type="fixed"><parent link="tool"/><child '
+        'link="tool0"/></joint></robot>'
     )
     fused = mujoco.MjModel.from_xml_string(URDF.replace("</robot>", frame))
-    refuses(InputError, "'tool0'.*fuses a link on a fixed joint of a URDF", Mount, robot, fused, "tool0")
+    refuses(
+        InputError, "'tool0'.*fuses a link on a fixed joint of a URDF", Mount, robot, fused, "tool0"
+    )
 
 
 URDF = (
-    '<robot name="r"><link name="base"/><link name="tool"><inertial><mass value="0.1"/><inertia ixx="1e-4" iyy="1e-4" '
-    'izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="j" type="continuous"><parent link="base"/>'
-    '<child link="tool"/><axis xyz="0 1 0"/></joint></robot>'
+    '<robot name="r"><link name="base"/><link name="tool"><inertial><mass value="0.1"/><inertia '
+    'ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="j" '
+    'type="continuous"><parent link="base"/><child link="tool"/><axis xyz="0 1 '
+    '0"/></joint></robot>'
 )
 
 
@@ -412,18 +494,43 @@ def test_an_arm_from_urdf():
 def test_what_cannot_be_mounted_is_refused(monkeypatch):
     robot, arm = beam(), mujoco.MjModel.from_xml_string(ARM)
     refuses(
-        InputError, "no body 'flnge', did you mean 'flange'.*'world', 'upper', 'flange'", Mount, robot, arm, "flnge"
+        InputError,
+        "no body 'flnge', did you mean 'flange'.*'world', 'upper', 'flange'",
+        Mount,
+        robot,
+        arm,
+        "flnge",
     )
     refuses(InputError, "the body 'world' cannot move", Mount, robot, arm, "world")
     refuses(InputError, "give six numbers", Mount, robot, arm, "flange", (0, 0))
     refuses(InputError, "the model is a str", Mount, robot, "arm.xml", "flange")
     refuses(InputError, "iterations is 1", Mount, robot, arm, "flange", iterations=1)
     refuses(InputError, r"steps of 5 ms and the robot of 4 ms", Mount, beam(0.004), arm, "flange")
-    refuses(InputError, r"gravity is .* in the model and \[0.0, 0.0, 0.0\]", Mount, beam(gravity=0), arm, "flange")
-    refuses(InputError, r"integrated_by\('implicit_euler'\)", Mount, robot.integrated_by("bdf2"), arm, "flange")
+    refuses(
+        InputError,
+        r"gravity is .* in the model and \[0.0, 0.0, 0.0\]",
+        Mount,
+        beam(gravity=0),
+        arm,
+        "flange",
+    )
+    refuses(
+        InputError,
+        r"integrated_by\('implicit_euler'\)",
+        Mount,
+        robot.integrated_by("bdf2"),
+        arm,
+        "flange",
+    )
     mount, moving = Mount(robot, arm, "flange"), at(arm)
     state = mount.begin(moving)
-    refuses(InputError, r"ctrl has shape \(3,\): give \(2,\) or \(1, 2\)", mount.step, state, [0.0, 0.0, 0.0])
+    refuses(
+        InputError,
+        r"ctrl has shape \(3,\): give \(2,\) or \(1, 2\)",
+        mount.step,
+        state,
+        [0.0, 0.0, 0.0],
+    )
     moving.qvel[0] = 1.0
     refuses(InputError, "the arm moves", mount.begin, moving)
     monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
@@ -440,7 +547,9 @@ def test_the_code_of_the_page_runs(monkeypatch):
 
 
 def growth(masses, stiffness, ratio, weights):
-    """Spectral radius of the scheme for a chain of masses, of one unit together, on a body of 1 / ratio; H = 1."""
+    """Spectral radius of the scheme for a chain of masses,
+    of one unit together, on a body of 1 / ratio; H = 1.
+    """
     count, memory = masses + 1, len(weights) - 1
     mass = np.diag([0.5, *[1.0] * (masses - 1), 0.5]) / masses
     spring = 2.0 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1)
@@ -460,14 +569,20 @@ def growth(masses, stiffness, ratio, weights):
     response = weights * np.array(response)
 
     def step(state):
-        (q, v), (last, before), past = state[: 2 * count].reshape(2, -1), state[2 * count :][:2], state[2 * count + 2 :]
+        (q, v), (last, before), past = (
+            state[: 2 * count].reshape(2, -1),
+            state[2 * count :][:2],
+            state[2 * count + 2 :],
+        )
         explained = response[1:] @ past
         a = -(explained + 2.0 * last - before) / (1.0 / ratio + response[0])
         q, v, reaction = follow(q, v, q[0] + v[0] + a)
         remainder = reaction - response[0] * a - explained
         return np.concatenate([q, v, [remainder, last], np.concatenate([[a], past])[:memory]])
 
-    return np.abs(np.linalg.eigvals(np.transpose([step(row) for row in np.eye(2 * count + 2 + memory)]))).max()
+    return np.abs(
+        np.linalg.eigvals(np.transpose([step(row) for row in np.eye(2 * count + 2 + memory)]))
+    ).max()
 
 
 def test_the_scheme_is_stable_for_chains_of_masses_with_a_memory_that_fades():

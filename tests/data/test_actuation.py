@@ -29,7 +29,13 @@ def test_sequences_rest_at_their_ends_within_the_limit_and_have_the_moments_aske
     typical = np.abs(np.diff(p, axis=1)).max()
     assert np.abs(np.diff(p, axis=1))[:, 10:13].max() < 0.25 * typical
     # Far from the ends and the limits the process is stationary.
-    settings = {"mean": 5e4, "deviation": 1e3, "correlation_time": 0.1, "limit": 1e5, "correlation": 0.6}
+    settings = {
+        "mean": 5e4,
+        "deviation": 1e3,
+        "correlation_time": 0.1,
+        "limit": 1e5,
+        "correlation": 0.6,
+    }
     p = drawn(200, **settings)[:, 60:90] - 5e4
     assert abs(p.mean()) < 150.0
     assert p.std() == pytest.approx(1e3, rel=0.08)
@@ -58,6 +64,11 @@ def test_recorded_inputs_are_checked_but_for_a_small_zero_error_of_a_gauge():
     high[3, 1] = 2.5e4
     refuses(DataFileError, r"data\.input_limit", check_inputs, high, PRESSURE, 2e4, "a.h5")
     tension = np.array([[-0.01, 1.0], [0.2, 0.5]])
-    np.testing.assert_array_equal(check_inputs(tension, TENSION, 2.0, "a.h5"), [[0.0, 1.0], [0.2, 0.5]])
-    with pytest.raises(DataFileError, match=r"a\.h5: the tension of tendon 1 is -0.5 N in frame 1: it must be zero or"):
+    np.testing.assert_array_equal(
+        check_inputs(tension, TENSION, 2.0, "a.h5"), [[0.0, 1.0], [0.2, 0.5]]
+    )
+    with pytest.raises(
+        DataFileError,
+        match=r"a\.h5: the tension of tendon 1 is -0.5 N in frame 1: it must be zero or",
+    ):
         check_inputs(np.array([[0.0], [-0.5]]), TENSION, 2.0, "a.h5")

@@ -27,7 +27,9 @@ def place(number, times):
 
 
 def turn(times):
-    return Rotation.from_rotvec(np.multiply.outer(0.5 * np.sin(2.0 * np.asarray(times)), [0.0, 0.0, 1.0]))
+    return Rotation.from_rotvec(
+        np.multiply.outer(0.5 * np.sin(2.0 * np.asarray(times)), [0.0, 0.0, 1.0])
+    )
 
 
 class Messages:
@@ -63,7 +65,9 @@ class Messages:
         fields = [field(name, 4 * number, 7, 1) for number, name in enumerate("xyz")]
         data = np.frombuffer(np.ascontiguousarray(points, dtype="<f4").tobytes(), dtype=np.uint8)
         cloud = self.of("sensor_msgs/msg/PointCloud2")
-        return cloud(self.header(time), 1, len(points), fields, False, 12, 12 * len(points), data, True)
+        return cloud(
+            self.header(time), 1, len(points), fields, False, 12, 12 * len(points), data, True
+        )
 
     def joints(self, time, **positions):
         names, none = [*positions], np.zeros(0)
@@ -71,7 +75,10 @@ class Messages:
         return self.of("sensor_msgs/msg/JointState")(self.header(time), names, values, none, none)
 
     def wrench(self, time, force):
-        parts = (self.of("geometry_msgs/msg/Vector3")(*map(float, part)) for part in (force, (0.0, time, 0.0)))
+        parts = (
+            self.of("geometry_msgs/msg/Vector3")(*map(float, part))
+            for part in (force, (0.0, time, 0.0))
+        )
         wrench = self.of("geometry_msgs/msg/Wrench")(*parts)
         return self.of("geometry_msgs/msg/WrenchStamped")(self.header(time), wrench)
 
@@ -85,10 +92,17 @@ def of_tip(source, *inputs):
 
 
 def written(path, kind="sqlite3", left_out=(), late=0.0, clock=None):
-    """A bag with two markers, a rigid body, two inputs and an image topic; ``clock`` changes times of /joint_states."""
+    """A bag with two markers, a rigid body, two inputs and an image topic.
+
+    ``clock`` changes times of /joint_states.
+    """
     store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
     if kind == "bag":  # not among the types of ROS 1 that rosbags brings
-        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+        store.register(
+            get_types_from_msg(
+                "geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"
+            )
+        )
     make = Messages(store)
     plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
     writer = Writer1(path) if kind == "bag" else Writer2(path, version=9, storage_plugin=plugin)
@@ -99,7 +113,11 @@ def written(path, kind="sqlite3", left_out=(), late=0.0, clock=None):
         def write(topic, message, time):
             if topic not in topics:
                 topics[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
-            writer.write(topics[topic], round(1e9 * (time + 100.0 + late)), serialize(message, message.__msgtype__))
+            writer.write(
+                topics[topic],
+                round(1e9 * (time + 100.0 + late)),
+                serialize(message, message.__msgtype__),
+            )
 
         for number, time in enumerate(TIMES):
             if number not in left_out:
@@ -120,12 +138,15 @@ def written(path, kind="sqlite3", left_out=(), late=0.0, clock=None):
     ("kind", "late", "file"), [("sqlite3", 0.0, ""), ("mcap", 30.0, "trial.mcap"), ("bag", 0.0, "")]
 )
 def test_topics_are_brought_to_common_frames(kind, late, file, tmp_path):
-    """Also where the clock of the computer that recorded is not that of the headers, which numbers lack."""
+    """Also where the clock of the computer that recorded is not
+    that of the headers, which numbers lack.
+    """
     path = written(tmp_path / ("trial.bag" if kind == "bag" else "trial"), kind, late=late)
     read = read_recording(path / file, bag=BagSettings(markers=MARKERS, inputs=INPUTS))
     assert read.rate == RATE
     assert read.labels == ("tip", "plate", "second", "plate +x", "plate +y", "plate +z")
-    times = 0.3 / RATE + np.arange(len(read.positions)) / RATE  # from the first message of the rigid body on
+    # From the first message of the rigid body on.
+    times = 0.3 / RATE + np.arange(len(read.positions)) / RATE
     assert len(times) == FRAMES - 1
     for column, number in enumerate(range(3)):
         np.testing.assert_allclose(read.positions[:, column], place(number, times), atol=2e-5)
@@ -137,7 +158,10 @@ def test_topics_are_brought_to_common_frames(kind, late, file, tmp_path):
 
 def test_a_bag_is_converted(folder):
     written(folder / "trial", "mcap")
-    assert "seen" in outcome("convert", "trial/trial.mcap", "recording.bag={markers: {tip: /mocap/tip}}").out
+    assert (
+        "seen"
+        in outcome("convert", "trial/trial.mcap", "recording.bag={markers: {tip: /mocap/tip}}").out
+    )
     tip = read_recording(folder / "recordings" / "trial.h5")
     np.testing.assert_allclose(tip.positions[:, 0], place(0, TIMES), atol=2e-5)
 
@@ -147,7 +171,9 @@ def test_a_pose_is_the_motion_of_the_base(tmp_path):
     read = read_recording(path, bag=BagSettings(markers={"tip": "/mocap/tip"}, base="/tf#plate"))
     times = np.maximum(TIMES, 0.3 / RATE)  # before its first message, the base is where that has it
     quaternions = turn(times).as_quat()[:, [3, 0, 1, 2]]
-    np.testing.assert_allclose(read.base, since_first(place(1, times), quaternions, path), atol=2e-4)
+    np.testing.assert_allclose(
+        read.base, since_first(place(1, times), quaternions, path), atol=2e-4
+    )
 
 
 def test_wrenches_are_readings_of_force_sensors(tmp_path):
@@ -161,14 +187,18 @@ def test_wrenches_are_readings_of_force_sensors(tmp_path):
 @pytest.mark.parametrize(
     ("clock", "said"),
     [
-        (lambda number, time: 1.0, "in the headers of /joint_states, 4 of 5 messages repeat the time of another"),
+        (
+            lambda number, time: 1.0,
+            "in the headers of /joint_states, 4 of 5 messages repeat the time of another",
+        ),
         (
             lambda number, time: time - 50.0 * (number > 15),
             "the time falls by 49.8 s at message 3: record it with a clock",
         ),
         (
             lambda number, time: time + 40.0,
-            "/joint_states#winch.* are of another clock than those of /mocap/tip: they differ by -40 s at the start",
+            "/joint_states#winch.* are of another clock than those of /mocap/tip: they differ by "
+            "-40 s at the start",
         ),
         (lambda number, time: 5.0 * time, "another clock .* at the start and -3.2 s at the end"),
     ],
@@ -181,12 +211,19 @@ def test_clocks_that_stand_still_fall_or_differ(tmp_path, clock, said):
 def test_a_message_that_comes_twice_is_left_out_and_counted(tmp_path, caplog):
     path = written(tmp_path / "trial", clock=lambda number, time: time - 0.2 * (number == 20))
     read = read_recording(path, bag=of_tip("/mocap/tip", "/joint_states#winch.position [mm]"))
-    np.testing.assert_allclose(read.actuation[:, 0], 0.5e-3 * np.repeat([0, 10, 10, 30, 40], [10, 10, 10, 10, 1]))
-    assert "trial: 1 of 5 messages of /joint_states left out, which repeat the time of another" in caplog.text
+    np.testing.assert_allclose(
+        read.actuation[:, 0], 0.5e-3 * np.repeat([0, 10, 10, 30, 40], [10, 10, 10, 10, 1])
+    )
+    assert (
+        "trial: 1 of 5 messages of /joint_states left out, which repeat the time of another"
+        in caplog.text
+    )
 
 
 def test_a_gap_is_not_bridged(tmp_path):
-    read = read_recording(written(tmp_path / "trial", left_out=range(10, 15)), bag=of_tip("/mocap/tip"))
+    read = read_recording(
+        written(tmp_path / "trial", left_out=range(10, 15)), bag=of_tip("/mocap/tip")
+    )
     np.testing.assert_array_equal(np.flatnonzero(~read.seen[:, 0]), range(10, 15))
     single = read_recording(written(tmp_path / "other", left_out=[10]), bag=of_tip("/mocap/tip"))
     assert single.seen.all()
@@ -200,13 +237,18 @@ def test_a_gap_is_not_bridged(tmp_path):
         (of_tip("/tf#tip"), DataFileError, "/tf has no message of tip"),
         (
             BagSettings(markers={"tip": "/mocap/tip"}, loads={"load": "/tf"}),
-            *(DataFileError, "/tf has messages of the type tf2_msgs/msg/TFMessage, which hold no force"),
+            DataFileError,
+            "/tf has messages of the type tf2_msgs/msg/TFMessage, which hold no force",
         ),
         (of_tip("/pressure#1"), DataFileError, "which hold no place"),
         (of_tip("/cloud"), InputError, "say which entry"),
         (of_tip("/mocap/tip", "/pressure#3 [mbar]"), DataFileError, "has 2 entries"),
         (of_tip("/mocap/tip", "/pressure#1 [psi]"), InputError, "whose unit is unknown"),
-        (of_tip("/mocap/tip", "/joint_states#winch"), InputError, "name the joint and its position"),
+        (
+            of_tip("/mocap/tip", "/joint_states#winch"),
+            InputError,
+            "name the joint and its position",
+        ),
         (of_tip("mocap tip"), InputError, "write a topic"),
         (BagSettings(markers={}), InputError, "data.bag.markers is empty"),
         (None, InputError, "name topics in data.bag .* /pressure .std_msgs/msg/Float64MultiArray"),
@@ -230,5 +272,8 @@ def test_files_that_are_no_bags_are_said(tmp_path):
     contents["other.mcap"] = whole.replace(b"ros2", b"json", 1)  # the profile of another recorder
     for name, content in contents.items():
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(DataFileError, match=rf"{name} is damaged, or no bag of ROS .*: record it with ROS again"):
+        with pytest.raises(
+            DataFileError,
+            match=rf"{name} is damaged, or no bag of ROS .*: record it with ROS again",
+        ):
             read_recording(tmp_path / name, bag=BagSettings(markers=MARKERS))

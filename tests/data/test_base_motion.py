@@ -5,7 +5,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.refusals import refuses
-from warp_resphys.data.base_motion import at_times, check_steps, followed, poses_of, prescribed, rigid, since_first
+from warp_resphys.data.base_motion import (
+    at_times,
+    check_steps,
+    followed,
+    poses_of,
+    prescribed,
+    rigid,
+    since_first,
+)
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.settings import parse
 from warp_resphys.settings.performed import MotionSettings
@@ -43,17 +51,25 @@ def test_nothing_moves_before_the_start_of_the_sinusoids():
 
 
 class TestTables:
-    @pytest.mark.parametrize(("delimiter", "decimal", "encoding"), [(",", ".", "utf-8"), (";", ",", "utf-16")])
+    @pytest.mark.parametrize(
+        ("delimiter", "decimal", "encoding"), [(",", ".", "utf-8"), (";", ",", "utf-16")]
+    )
     def test_a_table_gives_the_motion_of_its_point(self, tmp_path, delimiter, decimal, encoding):
         known = prescribed(SWING, TIMES)
         place, offset = np.array([0.03, 0.01, -0.02]), np.array([5.0, -2.0, 1.0])
         quaternions = Rotation.from_rotvec(known[:, 3:]).as_quat()[:, [3, 0, 1, 2]]
         table = np.column_stack([TIMES, moved(known, place[None])[:, 0] + offset, quaternions])
-        np.savetxt(tmp_path / "shaker.csv", table, delimiter=delimiter, header="t, x, y, z, w, i, j, k")
+        np.savetxt(
+            tmp_path / "shaker.csv", table, delimiter=delimiter, header="t, x, y, z, w, i, j, k"
+        )
         text = (tmp_path / "shaker.csv").read_text()
         (tmp_path / "shaker.csv").write_text(text.replace(".", decimal), encoding=encoding)
-        result = prescribed(MotionSettings(**{"file": "shaker.csv", "about": place}), TIMES[3:-3] + 0.004, tmp_path)
-        np.testing.assert_allclose(moved(result), moved(prescribed(SWING, TIMES[3:-3] + 0.004)), atol=2e-5)
+        result = prescribed(
+            MotionSettings(**{"file": "shaker.csv", "about": place}), TIMES[3:-3] + 0.004, tmp_path
+        )
+        np.testing.assert_allclose(
+            moved(result), moved(prescribed(SWING, TIMES[3:-3] + 0.004)), atol=2e-5
+        )
 
     @pytest.mark.parametrize("text", ["1,2,3\n", "0,0,0,0,1,0,0,0\n" * 5])
     def test_invalid_tables_of_poses_are_refused(self, tmp_path, text):
@@ -71,18 +87,29 @@ class TestRecorded:
         quaternions[::3] *= -2.0  # the same rotations
         result = rigid(since_first(known[:, :3], quaternions, "a.npz"))
         np.testing.assert_allclose(result.rotation, turned, atol=1e-12)
-        again = result.apply(np.broadcast_to(start.apply(POINTS[None]), (len(known), *POINTS.shape)))
+        again = result.apply(
+            np.broadcast_to(start.apply(POINTS[None]), (len(known), *POINTS.shape))
+        )
         np.testing.assert_allclose(again, moved(known), atol=1e-12)
 
     @pytest.mark.parametrize("wrong", [np.nan, 0.0])
     def test_an_invalid_quaternion_is_refused(self, wrong):
         quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (5, 1))
         quaternions[2] = wrong
-        refuses(DataFileError, "'base' needs, in every frame", since_first, np.zeros((5, 3)), quaternions, "a.npz")
+        refuses(
+            DataFileError,
+            "'base' needs, in every frame",
+            since_first,
+            np.zeros((5, 3)),
+            quaternions,
+            "a.npz",
+        )
 
     def test_rotation_vectors_go_on_beyond_half_a_turn(self):
         angles = np.linspace(0.0, 4.0 * np.pi, 200)
-        poses = poses_of(Rotation.from_rotvec(angles[:, None] * [0.0, 0.6, 0.8]).as_matrix(), np.zeros((200, 3)))
+        poses = poses_of(
+            Rotation.from_rotvec(angles[:, None] * [0.0, 0.6, 0.8]).as_matrix(), np.zeros((200, 3))
+        )
         np.testing.assert_allclose(poses[:, 3:], angles[:, None] * [0.0, 0.6, 0.8], atol=1e-9)
 
 
@@ -98,10 +125,13 @@ class TestFollowed:
         error = np.linalg.norm(moved(result) - moved(known), axis=-1)
         assert error.mean() < self.NOISE
         jerky = np.diff(moved(result), 2, axis=0) - np.diff(moved(known), 2, axis=0)
-        assert np.abs(jerky).mean() < 0.2 * self.NOISE  # unsmoothed, 2.4 times the noise over the root of their number
+        # Unsmoothed, 2.4 times the noise over the root of their number.
+        assert np.abs(jerky).mean() < 0.2 * self.NOISE
         markers = moved(prescribed(SWING, TIMES))
         markers[:150, :2] = np.nan
-        with pytest.raises(DataFileError, match=r"a\.npz: the base moves, and three .* in 25 % of the frames"):
+        with pytest.raises(
+            DataFileError, match=r"a\.npz: the base moves, and three .* in 25 % of the frames"
+        ):
             followed(markers, POINTS, "a.npz")
 
 
@@ -116,4 +146,11 @@ def test_a_motion_that_tears_a_body_is_refused():
     steps = prescribed(SWING, np.arange(0.0, 2.0, 0.01))
     check_steps(steps, POINTS, "a.npz")
     steps[50:, 0] += 0.03
-    refuses(DataFileError, r"a\.npz: the base jumps by .* mm in step 50,", check_steps, steps, POINTS, "a.npz")
+    refuses(
+        DataFileError,
+        r"a\.npz: the base jumps by .* mm in step 50,",
+        check_steps,
+        steps,
+        POINTS,
+        "a.npz",
+    )

@@ -1,4 +1,6 @@
-"""Cameras: the pinhole's equation, corrections, derivatives, points from depths, Young's modulus from pixels; views."""
+"""Cameras: the pinhole's equation, corrections, derivatives,
+points from depths, Young's modulus from pixels; views.
+"""
 
 import math
 
@@ -10,7 +12,14 @@ from scipy.spatial.transform import Rotation
 import warp_resphys as wr
 from support.refusals import refuses
 from support.slopes import differences
-from warp_resphys.data.camera import CameraMarkers, Lens, PlacedCamera, axes_from_below, motion_axes, path_axes
+from warp_resphys.data.camera import (
+    CameraMarkers,
+    Lens,
+    PlacedCamera,
+    axes_from_below,
+    motion_axes,
+    path_axes,
+)
 from warp_resphys.stepping.rotations import rotations
 
 X, Y, Z = np.eye(3)
@@ -25,14 +34,18 @@ SHIFT = np.array([-0.05, 0.02, 0.4])  # m: the camera stands 0.4 m away
 
 
 def camera(turn=TURN, shift=SHIFT):
-    intrinsic = torch.tensor([[FOCAL, 0.0, CENTRE[0]], [0.0, FOCAL, CENTRE[1]], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    intrinsic = torch.tensor(
+        [[FOCAL, 0.0, CENTRE[0]], [0.0, FOCAL, CENTRE[1]], [0.0, 0.0, 1.0]], dtype=torch.float64
+    )
     pose = np.block([[turn, shift[:, None]], [np.zeros(3), 1.0]])
     return CameraMarkers(MARKERS, PlacedCamera(Lens(intrinsic), torch.as_tensor(pose)))
 
 
 def beam(youngs_modulus):
     body = wr.Body(MESH, fixed=wr.select_vertices(MESH, x=0.0))
-    return wr.Simulator(body, wr.Corotated(youngs_modulus, 0.45, stiffness_damping=3e-3), time_step=0.01)
+    return wr.Simulator(
+        body, wr.Corotated(youngs_modulus, 0.45, stiffness_damping=3e-3), time_step=0.01
+    )
 
 
 def let_go(noise=0.0):
@@ -50,8 +63,11 @@ def let_go(noise=0.0):
 def test_a_marker_is_at_its_pinhole_projection_and_behind_the_camera_not_seen():
     shown = camera()(torch.as_tensor(MESH.vertices)[None])[0].numpy()
     x, y, z = (PLACES @ TURN.T + SHIFT).T
-    np.testing.assert_allclose(shown, np.column_stack([FOCAL * x / z, FOCAL * y / z]) + CENTRE, rtol=1e-12)
-    # The camera looks from the middle of the beam along it: the markers at the tip are in front, the other is behind.
+    np.testing.assert_allclose(
+        shown, np.column_stack([FOCAL * x / z, FOCAL * y / z]) + CENTRE, rtol=1e-12
+    )
+    # The camera looks from the middle of the beam along it: the markers at the tip are in front,
+    # the other is behind.
     looks = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     sees, at = camera(looks, -looks @ [0.08, 0.01, 0.0]), torch.as_tensor(MESH.vertices)[None]
     q = at.clone().requires_grad_(True)
@@ -109,7 +125,9 @@ def test_a_lens_is_read_and_distorts_as_opencv_does(tmp_path):
     moved_y = y * radial + 1e-3 * (square + 2.0 * y**2) - 4e-3 * x * y
     expected = np.column_stack([900.0 * moved_x + 320.0, 910.0 * moved_y + 240.0])
     np.testing.assert_allclose(lens.pixels(points), expected, rtol=1e-12)
-    rational = Lens(lens.matrix, torch.tensor([0.1, -0.2, 1e-3, -2e-3, 0.3, 0.5, 0.0, 0.0], dtype=torch.float64))
+    rational = Lens(
+        lens.matrix, torch.tensor([0.1, -0.2, 1e-3, -2e-3, 0.3, 0.5, 0.0, 0.0], dtype=torch.float64)
+    )
     tangential = Lens(lens.matrix, torch.tensor([0.0, 0.0, 1e-3, -2e-3], dtype=torch.float64))
     grown = rational.pixels(points)[0] - tangential.pixels(points)[0]
     share = (radial / (1.0 + 0.5 * square) - 1.0)[0]
@@ -117,14 +135,18 @@ def test_a_lens_is_read_and_distorts_as_opencv_does(tmp_path):
 
 
 def test_rays_are_the_inverse_of_pixels():
-    intrinsic = torch.tensor([[FOCAL, 2.0, CENTRE[0]], [0.0, 880.0, CENTRE[1]], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    intrinsic = torch.tensor(
+        [[FOCAL, 2.0, CENTRE[0]], [0.0, 880.0, CENTRE[1]], [0.0, 0.0, 1.0]], dtype=torch.float64
+    )
     pixels = torch.tensor([[0.0, 0.0], [639.0, 479.0], [300.0, 250.0]], dtype=torch.float64)
     for distortion in (None, torch.tensor([-0.3, 0.1, 2e-3, 1e-3], dtype=torch.float64)):
         lens = Lens(intrinsic, distortion)
         rays = lens.rays(pixels)
         assert rays[:, 2].tolist() == [1.0, 1.0, 1.0]
         torch.testing.assert_close(lens.pixels(rays), pixels, rtol=0.0, atol=1e-8)
-    beyond = Lens(intrinsic, torch.tensor([-0.4, 0.0, 0.0, 0.0], dtype=torch.float64)).rays(pixels + 3000.0)
+    beyond = Lens(intrinsic, torch.tensor([-0.4, 0.0, 0.0, 0.0], dtype=torch.float64)).rays(
+        pixels + 3000.0
+    )
     assert beyond[:, :2].isnan().all()  # where the lens cannot be undistorted
 
 
@@ -134,7 +156,11 @@ def test_rays_are_the_inverse_of_pixels():
         ("a: 1", wr.DataFileError, "has no camera_matrix of nine numbers"),
         ("camera_matrix: {data: [a]}", wr.DataFileError, "is no YAML with numbers"),
         ("[", wr.DataFileError, "is no YAML"),
-        ("camera_matrix: [1, 0, 2, 0, 3, 4, 0, 0, 1]\nD: [1, 2]", wr.InputError, "give k1, k2, p1, p2"),
+        (
+            "camera_matrix: [1, 0, 2, 0, 3, 4, 0, 0, 1]\nD: [1, 2]",
+            wr.InputError,
+            "give k1, k2, p1, p2",
+        ),
     ],
 )
 def test_files_without_a_calibration_are_said(text, error, words, tmp_path):
@@ -143,7 +169,9 @@ def test_files_without_a_calibration_are_said(text, error, words, tmp_path):
     refuses(wr.DataFileError, "Cannot read", Lens.read, tmp_path / "none.yaml")
 
 
-MATRIX = torch.tensor([[900.0, 0.0, 320.0], [0.0, 880.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+MATRIX = torch.tensor(
+    [[900.0, 0.0, 320.0], [0.0, 880.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64
+)
 LENS = Lens(MATRIX, torch.tensor([-0.12, 0.05, 1e-3, -2e-3], dtype=torch.float64))
 POSE = torch.eye(4, dtype=torch.float64)
 POSE[:3, :3] = rotations(torch.tensor([2.9, 0.2, -0.1], dtype=torch.float64))
@@ -167,8 +195,12 @@ def test_derivatives_by_motions_and_corrections_are_those_of_differences():
     step = 1e-6
     for number in range(3):
         ends = [PLACED.pixels(POINTS + by * tangents[number], corrections) for by in (step, -step)]
-        assert torch.allclose(slopes[number], (ends[0] - ends[1]) / (2.0 * step), rtol=1e-6, atol=1e-5)
-    by_correction = differences(lambda own: PLACED.pixels(POINTS, torch.as_tensor(own)), corrections.numpy(), step)
+        assert torch.allclose(
+            slopes[number], (ends[0] - ends[1]) / (2.0 * step), rtol=1e-6, atol=1e-5
+        )
+    by_correction = differences(
+        lambda own: PLACED.pixels(POINTS, torch.as_tensor(own)), corrections.numpy(), step
+    )
     assert torch.allclose(slopes[3:], torch.stack(by_correction), rtol=1e-6, atol=1e-5)
 
 
@@ -180,17 +212,23 @@ def test_corrections_mean_what_their_names_say():
     point = MIDDLE + torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64)
     plain = camera.pixels(point, camera.corrections({}))
     assert plain.tolist() == pytest.approx([320.0 + 900.0 * 0.15 / 0.51, 240.0])
-    shifted = camera.pixels(point, camera.corrections({"camera_shift_1": 0.01, "camera_shift_3": -0.01}))
+    shifted = camera.pixels(
+        point, camera.corrections({"camera_shift_1": 0.01, "camera_shift_3": -0.01})
+    )
     assert shifted.tolist() == pytest.approx([320.0 + 900.0 * 0.16 / 0.5, 240.0])
     # A quarter turn about z takes the point from x to y of the turn's centre.
     turned = camera.pixels(point, camera.corrections({"camera_turn_3": math.pi / 2.0}))
-    assert turned.tolist() == pytest.approx([320.0 + 900.0 * 0.05 / 0.51, 240.0 + 880.0 * 0.1 / 0.51])
+    assert turned.tolist() == pytest.approx(
+        [320.0 + 900.0 * 0.05 / 0.51, 240.0 + 880.0 * 0.1 / 0.51]
+    )
     lens = camera.pixels(point, camera.corrections({"focal_factor": 1.1, "principal_point_2": 5.0}))
     assert lens.tolist() == pytest.approx([320.0 + 990.0 * 0.15 / 0.51, 245.0])
 
 
 def test_located_points_are_those_that_are_seen():
-    """From pixels and depths through a distorted lens, and from the axes of a scan, with derivatives."""
+    """From pixels and depths through a distorted lens,
+    and from the axes of a scan, with derivatives.
+    """
     corrections = PLACED.corrections(MOVED)
     depth = PLACED.seen_from(POINTS, corrections)[:, 2:]
     measured = torch.cat([PLACED.pixels(POINTS, corrections), depth], 1)
@@ -202,7 +240,9 @@ def test_located_points_are_those_that_are_seen():
             return camera.located(own, torch.as_tensor(by))
 
         slopes = differences(located, corrections.numpy(), 1e-6)
-        assert torch.allclose(camera.located_by(own, corrections), torch.stack(slopes), rtol=1e-6, atol=1e-8)
+        assert torch.allclose(
+            camera.located_by(own, corrections), torch.stack(slopes), rtol=1e-6, atol=1e-8
+        )
 
 
 @pytest.mark.parametrize("plane", [(X, Y), (X, -Y), (Y, X), (X, Z), (-Y, Z), (X, Y + Z)])

@@ -1,4 +1,6 @@
-"""Randomly damaged files: every reader returns data or raises one sentence, within limits of memory and time."""
+"""Randomly damaged files: every reader returns data or raises one sentence,
+within limits of memory and time.
+"""
 
 import json
 import subprocess
@@ -30,37 +32,72 @@ def rows(separator, *columns):
 def write_c3d(path):
     file = ezc3d.c3d()
     point = file["parameters"]["POINT"]
-    point["UNITS"]["value"], point["RATE"]["value"], point["LABELS"]["value"] = ["mm"], [100.0], list("abc")
-    file["data"]["points"] = np.concatenate([1e3 * POSITIONS.transpose(2, 1, 0), np.ones((1, 3, 12))])
+    point["UNITS"]["value"], point["RATE"]["value"], point["LABELS"]["value"] = (
+        ["mm"],
+        [100.0],
+        list("abc"),
+    )
+    file["data"]["points"] = np.concatenate(
+        [1e3 * POSITIONS.transpose(2, 1, 0), np.ones((1, 3, 12))]
+    )
     file.write(str(path))
 
 
 def write_csv(path):
-    header = ",".join(["time [s]", *(f"{label}.{axis} [mm]" for label in "abc" for axis in "xyz"), "valve [bar]"])
-    path.write_text("\n".join([header, *rows(",", FRAMES / 100, 1e3 * POSITIONS.reshape(12, 9), FRAMES)]) + "\n")
+    header = ",".join(
+        ["time [s]", *(f"{label}.{axis} [mm]" for label in "abc" for axis in "xyz"), "valve [bar]"]
+    )
+    path.write_text(
+        "\n".join([header, *rows(",", FRAMES / 100, 1e3 * POSITIONS.reshape(12, 9), FRAMES)]) + "\n"
+    )
 
 
 def write_tsv(path):
     head = ["NO_OF_FRAMES\t12", "NO_OF_MARKERS\t3", "FREQUENCY\t100", "MARKER_NAMES\ta\tb\tc"]
-    head += ["\t".join(["Frame", "Time", *(f"{label} {axis}" for label in "abc" for axis in "XYZ")])]
-    path.write_text("\n".join([*head, *rows("\t", FRAMES + 1, FRAMES / 100, 1e3 * POSITIONS.reshape(12, 9))]) + "\n")
+    head += [
+        "\t".join(["Frame", "Time", *(f"{label} {axis}" for label in "abc" for axis in "XYZ")])
+    ]
+    path.write_text(
+        "\n".join([*head, *rows("\t", FRAMES + 1, FRAMES / 100, 1e3 * POSITIONS.reshape(12, 9))])
+        + "\n"
+    )
 
 
 def write_motive(path):
-    head = ["Format Version,1.23,Export Frame Rate,100,Length Units,Meters", ",Type," + ",".join(["Marker"] * 9)]
-    head += [",Name," + ",".join(label for label in "abc" for _ in range(3)), "Frame,Time," + ",".join("XYZXYZXYZ")]
-    path.write_text("\n".join([*head, *rows(",", FRAMES, FRAMES / 100, POSITIONS.reshape(12, 9))]) + "\n")
+    head = [
+        "Format Version,1.23,Export Frame Rate,100,Length Units,Meters",
+        ",Type," + ",".join(["Marker"] * 9),
+    ]
+    head += [
+        ",Name," + ",".join(label for label in "abc" for _ in range(3)),
+        "Frame,Time," + ",".join("XYZXYZXYZ"),
+    ]
+    path.write_text(
+        "\n".join([*head, *rows(",", FRAMES, FRAMES / 100, POSITIONS.reshape(12, 9))]) + "\n"
+    )
 
 
 def write_npz(path):
-    known = {"labels": np.array(list("abc")), "rate_hz": 100.0, "units": "m", "start": 0.5, "rest": POSITIONS[0]}
+    known = {
+        "labels": np.array(list("abc")),
+        "rate_hz": 100.0,
+        "units": "m",
+        "start": 0.5,
+        "rest": POSITIONS[0],
+    }
     np.savez(path, positions=POSITIONS, actuation=np.ones((12, 2)), actuation_units="kPa", **known)
 
 
 def write_hdf5(path):
     with h5py.File(path, "w") as file:
-        file.attrs.update({"rate_hz": 100.0, "labels": list("abc"), "format": "of another program", "start": 0.5})
-        file["positions"], file["actuation"], file["rest"] = POSITIONS, np.ones((12, 2)), POSITIONS[0]
+        file.attrs.update(
+            {"rate_hz": 100.0, "labels": list("abc"), "format": "of another program", "start": 0.5}
+        )
+        file["positions"], file["actuation"], file["rest"] = (
+            POSITIONS,
+            np.ones((12, 2)),
+            POSITIONS[0],
+        )
         file["positions"].attrs["units"], file["actuation"].attrs["units"] = "m", "kPa"
 
 
@@ -102,7 +139,9 @@ def damaged(content, random):
     if kind == 2:
         return content[:at] + content[at : at + 100] + content[at:]
     for place in random.integers(len(content), size=random.integers(1, 5)):
-        content[place] = random.choice([random.integers(256), content[place] ^ 1, content[place] ^ 128, 0, 255, 57])
+        content[place] = random.choice(
+            [random.integers(256), content[place] ^ 1, content[place] ^ 128, 0, 255, 57]
+        )
     return content
 
 
@@ -128,7 +167,9 @@ def read_damaged(tmp_path, name, write, read, seed, count):
         except (DataFileError, InputError) as error:
             refused += is_one_sentence(str(error), tmp_path / name)
         except BaseException as error:
-            raise AssertionError(f"{name}, damaged as number {number} of seed {seed}: {error!r}") from error
+            raise AssertionError(
+                f"{name}, damaged as number {number} of seed {seed}: {error!r}"
+            ) from error
         assert time.perf_counter() - began < 60.0
     return refused
 
@@ -146,7 +187,11 @@ def test_damaged_files_that_are_read_in_this_process(tmp_path, name):
 SERVER = """
 import json, os, signal, sys
 from warp_resphys.io import decoding
-libraries = {"ezc3d": decoding.c3d_arrays, "h5py": decoding.hdf5_arrays, "meshio": decoding.mesh_arrays}
+libraries = {
+    "ezc3d": decoding.c3d_arrays,
+    "h5py": decoding.hdf5_arrays,
+    "meshio": decoding.mesh_arrays,
+}
 for number, line in enumerate(sys.stdin):
     memory, seconds, library, path, *names = json.loads(line)
     if number == 0:
@@ -172,7 +217,9 @@ def forked(tmp_path, monkeypatch):
 
     def run(command, env, **_):
         if not taken:
-            servers.append(subprocess.Popen([sys.executable, "-P", "-c", SERVER], env=env, **places))
+            servers.append(
+                subprocess.Popen([sys.executable, "-P", "-c", SERVER], env=env, **places)
+            )
         server = servers[0]
         server.stdin.write(json.dumps(command[command.index("-m") + 2 :]) + "\n")
         server.stdin.flush()
@@ -184,7 +231,9 @@ def forked(tmp_path, monkeypatch):
     servers = []
     monkeypatch.setattr(decoding, "MEMORY", (1 << 29, 64))
     monkeypatch.setattr(decoding, "SECONDS", (1.0, 2e-6))
-    monkeypatch.setattr(decoding, "subprocess", SimpleNamespace(run=run, TimeoutExpired=subprocess.TimeoutExpired))
+    monkeypatch.setattr(
+        decoding, "subprocess", SimpleNamespace(run=run, TimeoutExpired=subprocess.TimeoutExpired)
+    )
     yield taken
     for server in servers:
         server.communicate()

@@ -16,7 +16,10 @@ TIP = np.stack([0.02 * np.sin(5.0 * TIMES), 0.1 + 0.0 * TIMES, 0.01 * TIMES], -1
 
 def table(path, header, times, separator=","):
     """A table with the tip in millimetres and a pressure."""
-    rows = [[time, *(f"{1e3 * x:.6f}" for x in tip), "12.5"] for time, tip in zip(times, TIP, strict=True)]
+    rows = [
+        [time, *(f"{1e3 * x:.6f}" for x in tip), "12.5"]
+        for time, tip in zip(times, TIP, strict=True)
+    ]
     path.write_text("\n".join([*header, *(separator.join(map(str, row)) for row in rows)]))
     return path
 
@@ -44,9 +47,14 @@ def test_dates_that_do_not_fit_are_named(tmp_path):
     times = [f"2026-02-28T23:59:59.{20 * n:03d}" for n in range(30)]
     for wrong in ("2026-02-28T23:59:59.060Z", "3"):
         path = table(tmp_path / "a.csv", [HEADER.format("")], [*times[:3], wrong, *times[4:]])
-        with pytest.raises(DataFileError, match=rf"a\.csv, line 5, column 1: '{wrong}' is no date and time as the oth"):
+        with pytest.raises(
+            DataFileError,
+            match=rf"a\.csv, line 5, column 1: '{wrong}' is no date and time as the oth",
+        ):
             read_recording(path)
-    with pytest.raises(DataFileError, match="gives its time in 'h': it must be in s, ms, us, ns or iso"):
+    with pytest.raises(
+        DataFileError, match="gives its time in 'h': it must be in s, ms, us, ns or iso"
+    ):
         read_recording(table(tmp_path / "a.csv", [HEADER.format(" [h]")], range(30)))
 
 
@@ -57,12 +65,15 @@ def test_columns_are_chosen_by_the_names_of_the_file(tmp_path):
     times = [f"{time - 100.0:.3f}" for time in TIMES]
     lines = ["recorded on a Monday", "t\tX (mm)\tY (mm)\tZ (mm)\tpump"]
     path = table(tmp_path / "a.tsv", lines, times, "\t")
-    read = read_recording(path, table=TableSettings(names={**NAMES, "pump": "pump [kPa]"}, header_lines=1))
+    read = read_recording(
+        path, table=TableSettings(names={**NAMES, "pump": "pump [kPa]"}, header_lines=1)
+    )
     np.testing.assert_allclose(read.positions[:, 0], TIP, atol=1e-9)
     np.testing.assert_allclose(read.actuation, 12.5e3)
     assert read_recording(path, table=TableSettings(names=NAMES, header_lines=1)).actuation is None
     with pytest.raises(
-        DataFileError, match=r"line 2: data\.table\.names has 'X', which 0 columns are named; it has 't'"
+        DataFileError,
+        match=r"line 2: data\.table\.names has 'X', which 0 columns are named; it has 't'",
     ):
         read_recording(path, table=TableSettings(names={**NAMES, "X": "a.x"}, header_lines=1))
 
@@ -96,7 +107,9 @@ def trajectory():
     return generator.normal(size=(40, 3, 3)).cumsum(axis=0)
 
 
-@pytest.mark.parametrize(("unit", "size"), [("mm", 1e3), ("MM\0", 1e3), ("Meters", 1.0), (" metre ", 1.0), ("CM", 1e2)])
+@pytest.mark.parametrize(
+    ("unit", "size"), [("mm", 1e3), ("MM\0", 1e3), ("Meters", 1.0), (" metre ", 1.0), ("CM", 1e2)]
+)
 def test_read_c3d_converts_units_and_keeps_occlusions(tmp_path, trajectory, caplog, unit, size):
     trajectory[7:9, 1] = np.nan
     trajectory[3, 2] = 0.0
@@ -134,7 +147,10 @@ def test_an_unknown_unit_and_the_byte_order_of_sgi_are_refused(tmp_path, traject
     content = bytearray(write_c3d(tmp_path / "a.c3d", trajectory, "abc").read_bytes())
     content[(content[0] - 1) * 512 + 3] = 86
     (tmp_path / "a.c3d").write_bytes(content)
-    with pytest.raises(DataFileError, match=r"a\.c3d has the byte order of SGI \(MIPS\) computers, which is not read"):
+    with pytest.raises(
+        DataFileError,
+        match=r"a\.c3d has the byte order of SGI \(MIPS\) computers, which is not read",
+    ):
         read_recording(tmp_path / "a.c3d")
 
 
@@ -150,7 +166,8 @@ def test_truncated_file(tmp_path, trajectory, part):
     ("name", "after", "value", "limits", "message"),
     [
         ("CONTACT", 10, 0xFF, {}, "ezc3d ends with -11"),  # of -1 dimensions
-        ("RATIO", 10, 0x80, {"MEMORY": (1 << 29, 0)}, "it takes more than 512 MiB of memory"),  # -32768 values a frame
+        # -32768 values a frame
+        ("RATIO", 10, 0x80, {"MEMORY": (1 << 29, 0)}, "it takes more than 512 MiB of memory"),
         ("CONTACT", 10, 0x7F, {"SECONDS": (1.0, 0.0)}, "takes more than 1 s"),  # of 127 dimensions
     ],
 )
@@ -163,12 +180,19 @@ def test_a_changed_byte_that_crashes_the_decoder_or_makes_it_claim_memory_or_tim
     path.write_bytes(content)
     for limit, given in limits.items():
         monkeypatch.setattr(decoding, limit, given)
-    refuses(DataFileError, rf"whole\.c3d cannot be decoded \(.*{message}\): copy", read_recording, path)
+    refuses(
+        DataFileError, rf"whole\.c3d cannot be decoded \(.*{message}\): copy", read_recording, path
+    )
 
 
 def test_uneven_times_are_sampled_again(tmp_path, caplog):
-    """Positions are linear between lines, inputs hold, a long gap is an occlusion, and a last line may be cut off."""
-    lines = ["t, X, Y, Z, p", *(f"{t}, {20.0 * t}, 0, 0, {p}" for t, p in ((5.0, 1), (5.03, 2), (5.11, 3), (5.13, 4)))]
+    """Positions are linear between lines, inputs hold,
+    a long gap is an occlusion, and a last line may be cut off.
+    """
+    lines = [
+        "t, X, Y, Z, p",
+        *(f"{t}, {20.0 * t}, 0, 0, {p}" for t, p in ((5.0, 1), (5.03, 2), (5.11, 3), (5.13, 4))),
+    ]
     lines += [f"{t}, {20.0 * t}, 0, 0, 5" for t in (5.45, 5.5)]
     path = tmp_path / "loop.csv"
     path.write_text("\n".join([*lines, "5.55, 11.1, 0"]))
@@ -177,19 +201,42 @@ def test_uneven_times_are_sampled_again(tmp_path, caplog):
     times = 5.0 + 0.05 * np.arange(11)
     expected = np.where((times > 5.14) & (times < 5.44), np.nan, 0.02 * times)
     np.testing.assert_allclose(read.positions[:, 0, 0], expected, rtol=1e-12)
-    np.testing.assert_allclose(read.actuation[:, 0], 1e3 * np.array([1, 2, 2, 4, 4, 4, 4, 4, 4, 5, 5]))
+    np.testing.assert_allclose(
+        read.actuation[:, 0], 1e3 * np.array([1, 2, 2, 4, 4, 4, 4, 4, 4, 5, 5])
+    )
     assert (read.rate, read.start) == (20.0, 5.0)
     assert "loop.csv: the last line, 8, is cut off, and left out." in caplog.text
     path.write_text("\n".join(lines))
-    refuses(DataFileError, "the frames are not evenly spaced", read_recording, path, table=TableSettings(names=names))
+    refuses(
+        DataFileError,
+        "the frames are not evenly spaced",
+        read_recording,
+        path,
+        table=TableSettings(names=names),
+    )
     path.write_text("\n".join([*lines[:3], lines[1], *lines[3:]]))
     sampled = TableSettings(names=names, rate=20.0)
-    refuses(DataFileError, "line 4: the time or frame does not rise", read_recording, path, table=sampled)
+    refuses(
+        DataFileError,
+        "line 4: the time or frame does not rise",
+        read_recording,
+        path,
+        table=sampled,
+    )
 
 
 def test_unseen_cells_of_uneven_times_stay_where_they_are(tmp_path):
-    """Each coordinate is linear between the lines that have it, and inputs hold where a line has none."""
-    rows = [(0.0, 0.0, 1), (0.03, "", 2), (0.05, 50.0, ""), (0.11, "", ""), (0.15, "", 3), (0.2, 200.0, 4)]
+    """Each coordinate is linear between the lines that have it,
+    and inputs hold where a line has none.
+    """
+    rows = [
+        (0.0, 0.0, 1),
+        (0.03, "", 2),
+        (0.05, 50.0, ""),
+        (0.11, "", ""),
+        (0.15, "", 3),
+        (0.2, 200.0, 4),
+    ]
     path = tmp_path / "loop.csv"
     path.write_text("\n".join(["t, X, Y, Z, p", *(f"{t}, {x}, 0, 0, {p}" for t, x, p in rows)]))
     names = {"t": "time [s]", "X": "a.x [mm]", "Y": "a.y [mm]", "Z": "a.z [mm]", "p": "p [kPa]"}
@@ -197,7 +244,17 @@ def test_unseen_cells_of_uneven_times_stay_where_they_are(tmp_path):
     np.testing.assert_allclose(read.positions[:, 0, 0], [0.0, 0.05, 0.1, 0.15, 0.2], atol=1e-12)
     np.testing.assert_allclose(read.actuation[:, 0], [1e3, 2e3, 2e3, 3e3, 4e3])
     few = TableSettings(names=names, rate=1.0)
-    refuses(DataFileError, "has less than two frames at 1 Hz: raise data.table.rate", read_recording, path, table=few)
-    path.write_text("\n".join(["t, X, Y, Z, p", *(f"{t}, 0, 0, 0, 1" for t in (0, 0.05, 0.1, 1732886400.0))]))
+    refuses(
+        DataFileError,
+        "has less than two frames at 1 Hz: raise data.table.rate",
+        read_recording,
+        path,
+        table=few,
+    )
+    path.write_text(
+        "\n".join(["t, X, Y, Z, p", *(f"{t}, 0, 0, 0, 1" for t in (0, 0.05, 0.1, 1732886400.0))])
+    )
     foreign = "line 5: from the line before on, time or frame passes from 0.1 to"
-    refuses(DataFileError, foreign, read_recording, path, table=TableSettings(names=names, rate=20.0))
+    refuses(
+        DataFileError, foreign, read_recording, path, table=TableSettings(names=names, rate=20.0)
+    )

@@ -8,7 +8,9 @@ from scipy.spatial.transform import Rotation
 from warp_resphys import InputError, bind_markers, box_hexahedra
 from warp_resphys.data.marker_view import MarkerView, ViewedMarkers
 
-NOMINAL = np.array([[0.0, 0.01, -0.07], [0.002, -0.02, -0.04], [0.0, 0.015, 0.036], [0.004, 0.0, 0.063]])
+NOMINAL = np.array(
+    [[0.0, 0.01, -0.07], [0.002, -0.02, -0.04], [0.0, 0.015, 0.036], [0.004, 0.0, 0.063]]
+)
 PLACES = torch.as_tensor(NOMINAL)
 VIEWS = {
     "plane": MarkerView(PLACES, "xz"),
@@ -40,20 +42,28 @@ def test_depth_is_not_observed():
 
 @pytest.mark.parametrize(
     ("name", "axis", "angle"),
-    [("own", [0.6, -0.64, 0.48], 3.1), ("own plane", [0, 1, 0], -2.0), ("own plane, turned", [1, 0, 0], 3.1)],
+    [
+        ("own", [0.6, -0.64, 0.48], 3.1),
+        ("own plane", [0, 1, 0], -2.0),
+        ("own plane, turned", [1, 0, 0], 3.1),
+    ],
 )
 def test_the_view_of_a_shape_is_invariant_to_rigid_motion(name, axis, angle):
     """In three dimensions or in the plane, moved by any angle: the same shape, and no other."""
     points, view = shaken(), VIEWS[name]
     shift = np.array([0.3, -0.2, 0.1])
-    np.testing.assert_allclose(view.of_arrays(moved(points, angle, axis, shift)), view.of_arrays(points), atol=1e-12)
+    np.testing.assert_allclose(
+        view.of_arrays(moved(points, angle, axis, shift)), view.of_arrays(points), atol=1e-12
+    )
     spread = view.of_arrays(points)
     assert np.abs(spread - spread[:1]).max() > 5e-3
 
 
 @pytest.mark.parametrize("name", VIEWS)
 def test_gradients_at_rest_and_after_a_large_turn(name):
-    """Against central differences, at the nominal places too, where the singular values of a plane's are no three."""
+    """Against central differences, at the nominal places too,
+    where the singular values of a plane's are no three.
+    """
     turned = moved(shaken(count=2), 2.5, [0.0, 1.0, 0.0], 0.1)
     points = torch.as_tensor(np.concatenate([NOMINAL[None], turned])).requires_grad_()
     assert torch.autograd.gradcheck(VIEWS[name], (points,), eps=1e-6, atol=1e-7)
@@ -61,7 +71,9 @@ def test_gradients_at_rest_and_after_a_large_turn(name):
 
 @pytest.mark.parametrize("name", VIEWS)
 def test_a_body_is_carried_with_its_markers(name):
-    """A point of the body at a marker has the marker's viewed position, apart from the unseen depth."""
+    """A point of the body at a marker has the marker's viewed position,
+    apart from the unseen depth.
+    """
     points, view = torch.as_tensor(moved(shaken(), 1.2, [0.0, 1.0, 0.0], 0.2)), VIEWS[name]
     body = torch.cat([points, points.flip(-2) + 0.01], -2)
     carried, context = view.carried(body, points), view(points)
@@ -71,7 +83,9 @@ def test_a_body_is_carried_with_its_markers(name):
     seen = [axis for axis in range(3) if axis != view.unseen]
     np.testing.assert_allclose(carried[:, :4, seen], context[..., seen], atol=1e-12)
     if view.plane is None:  # rigidly
-        np.testing.assert_allclose(torch.cdist(carried, carried), torch.cdist(body, body), atol=1e-12)
+        np.testing.assert_allclose(
+            torch.cdist(carried, carried), torch.cdist(body, body), atol=1e-12
+        )
     else:
         np.testing.assert_allclose(carried[..., view.unseen], body[..., view.unseen], atol=1e-12)
 
@@ -97,8 +111,11 @@ def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
     bent[0, mesh.vertices[:, 0] > 0.07] += 0.01
     assert float((seen(bent)[0] - torch.as_tensor(places)).norm(dim=1).max()) > 2e-3
     slope = seen.transposed_jacobian(bent).view(1, -1, 3, 9)
-    assert float(slope.sum(1).abs().max()) < 1e-10 < float(slope.abs().max())  # all vertices alike change no shape
-    spin = torch.linalg.cross(torch.tensor([0.3, -0.5, 0.8], dtype=torch.float64).expand_as(bent[0]), bent[0])
+    # All vertices alike change no shape.
+    assert float(slope.sum(1).abs().max()) < 1e-10 < float(slope.abs().max())
+    spin = torch.linalg.cross(
+        torch.tensor([0.3, -0.5, 0.8], dtype=torch.float64).expand_as(bent[0]), bent[0]
+    )
     assert float(torch.einsum("ni,nim->m", spin, slope[0]).abs().max()) < 1e-10  # nor does a turn
     by = torch.tensor([[0.002, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
     assert not torch.allclose(seen.moved(by)(at), seen(at), atol=1e-4)
@@ -113,10 +130,19 @@ def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
     [
         ((PLACES, "xx"), r"markers\.plane"),
         ((PLACES, "xyz"), "name two of the body's axes"),
-        ((PLACES * torch.tensor([0, 0, 1]), None, True), "the 4 markers that are seen together lie on one line"),
+        (
+            (PLACES * torch.tensor([0, 0, 1]), None, True),
+            "the 4 markers that are seen together lie on one line",
+        ),
         ((PLACES[:1], "xz", True), "the 1 markers that are seen together are at one place"),
-        ((PLACES, None, True, ((0, 1, 2), (1, 2, 3))), "two trials have some markers in common, and not all"),
-        ((PLACES, None, True, ((0, 1), (2, 3))), "the 2 markers that are seen together lie on one line"),
+        (
+            (PLACES, None, True, ((0, 1, 2), (1, 2, 3))),
+            "two trials have some markers in common, and not all",
+        ),
+        (
+            (PLACES, None, True, ((0, 1), (2, 3))),
+            "the 2 markers that are seen together lie on one line",
+        ),
     ],
 )
 def test_degenerate_markers_are_refused(arguments, said):

@@ -1,4 +1,7 @@
-"""Gaps, rates, releases, jumps and quality of recordings; when a valve opens; and the published segment."""
+"""Gaps, rates, releases, jumps and quality of recordings; when a valve opens.
+
+And the published segment.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -18,11 +21,15 @@ NOISE = 5e-6
 RELEASE = 60.4
 TIP = ("tip 1", "tip 2")
 BASE = ("base 1", "base 2", "base 3")
-PLACES = np.array([[0.1, 0.0, 0.02], [0.1, 0.02, 0.0], [0.0, 0.0, 0.0], [0.0, 0.04, 0.0], [0.0, 0.0, 0.03]])
+PLACES = np.array(
+    [[0.1, 0.0, 0.02], [0.1, 0.02, 0.0], [0.0, 0.0, 0.0], [0.0, 0.04, 0.0], [0.0, 0.0, 0.03]]
+)
 
 
 def swinging(frames=300, rate=100.0, noise=NOISE, shift=0.0):
-    """A beam that is held and let go in frame 60.4: two markers swing by 10 mm at 7.7 Hz, three stand on the clamp."""
+    """A beam that is held and let go in frame 60.4:
+    two markers swing by 10 mm at 7.7 Hz, three stand on the clamp.
+    """
     time = np.maximum(np.arange(frames) - RELEASE, 0.0) / rate
     sag = -0.01 * (1.0 - np.exp(-2.5 * time) * np.cos(48.0 * time))
     positions = np.tile(PLACES + shift, (frames, 1, 1))
@@ -42,9 +49,17 @@ def test_masked_gaps_stay_and_short_ones_are_filled():
     assert filled.seen[:, 0].all()
     np.testing.assert_array_equal(np.flatnonzero(~filled.seen[:, 1]), np.arange(150, 170))
     np.testing.assert_array_equal(np.flatnonzero(~filled.seen[:, 2]), np.arange(4))
-    np.testing.assert_array_equal(filled.positions[recording.seen], recording.positions[recording.seen])
+    np.testing.assert_array_equal(
+        filled.positions[recording.seen], recording.positions[recording.seen]
+    )
     recording.positions[:, 3] = np.nan
-    refuses(DataFileError, r"swing\.c3d: marker base 2 is seen in 0 of 300 frames", fill_gaps, recording, 5)
+    refuses(
+        DataFileError,
+        r"swing\.c3d: marker base 2 is seen in 0 of 300 frames",
+        fill_gaps,
+        recording,
+        5,
+    )
 
 
 def test_a_multiple_of_the_rate_is_thinned_exactly():
@@ -53,8 +68,12 @@ def test_a_multiple_of_the_rate_is_thinned_exactly():
     np.testing.assert_array_equal(thinned.actuation[:, 0], np.arange(0.0, 300.0, 2.0))
     np.testing.assert_array_equal(thinned.positions, recording.positions[::2])
     assert thinned.rate == 50.0
-    np.testing.assert_array_equal(processing.resample(recording, 100.0).positions, recording.positions)
-    np.testing.assert_array_equal(processing.resample(recording, 1.0 / 0.03).positions, recording.positions[::3])
+    np.testing.assert_array_equal(
+        processing.resample(recording, 100.0).positions, recording.positions
+    )
+    np.testing.assert_array_equal(
+        processing.resample(recording, 1.0 / 0.03).positions, recording.positions[::3]
+    )
 
 
 @pytest.mark.parametrize("rate", [60.0, 130.0])
@@ -63,7 +82,9 @@ def test_interpolation_follows_a_swing(rate):
     omega, frames = 2.0 * np.pi * 7.7, np.arange(301)
     path = 0.01 * np.sin(omega * frames / 100.0)
     positions = np.stack([path, path**2, 0.0 * path], axis=1)[:, None] * [1.0, 100.0, 1.0]
-    recording = Recording(("a",), positions, 100.0, Path("swing.c3d"), actuation=path[:, None], start=0.004)
+    recording = Recording(
+        ("a",), positions, 100.0, Path("swing.c3d"), actuation=path[:, None], start=0.004
+    )
     new = processing.resample(recording, rate)
     assert len(new.positions) == int(3.0 * rate) + 1
     assert new.start == 0.004
@@ -99,7 +120,8 @@ def test_the_release_is_found_from_the_markers_that_are_seen():
     assert 8 <= result.rest[0] < result.rest[1] <= 61
     recording.positions[50:70, 1] = np.nan
     with pytest.raises(
-        DataFileError, match=r"in swing\.c3d, frames 8 to 57, the first without a long gap: the tip never"
+        DataFileError,
+        match=r"in swing\.c3d, frames 8 to 57, the first without a long gap: the tip never",
     ):
         release_of(recording, TIP, 5)
     recording = swinging()
@@ -165,7 +187,12 @@ def test_quality_of_a_recording():
     recording.positions[40:, 3] += 1e-3
     result = marker_quality.quality(recording, BASE, longest_gap=5)
     tip, tip2, drifting, jumping, good = result.markers
-    assert (tip.gaps, tip.longest_gap_frames, tip.masked_frames, tip.seen) == (2, 3, 3, pytest.approx(294 / 300))
+    assert (tip.gaps, tip.longest_gap_frames, tip.masked_frames, tip.seen) == (
+        2,
+        3,
+        3,
+        pytest.approx(294 / 300),
+    )
     assert (tip2.gaps, tip2.longest_gap_frames, tip2.masked_frames) == (1, 20, 20)
     assert drifting.drift_mm == pytest.approx(0.9, rel=0.02)
     assert [jump.frame for jump in jumping.jumps] == [40]
@@ -181,7 +208,13 @@ def test_quality_of_a_recording():
     table = marker_quality.quality_table(result.markers)
     assert table["tip 1"][:4] == ["98.0 %", "2", "3", "3"]
     assert table["base 2"][4] == "1 (1.73 mm)"
-    refuses(DataFileError, r"swing\.c3d has no marker named 'foot'", marker_quality.quality, recording, ["foot"])
+    refuses(
+        DataFileError,
+        r"swing\.c3d has no marker named 'foot'",
+        marker_quality.quality,
+        recording,
+        ["foot"],
+    )
 
 
 def test_base_markers_that_were_moved():
@@ -193,7 +226,9 @@ def test_base_markers_that_were_moved():
     with pytest.raises(DataFileError, match=r"base 1 stands 8\.66 mm from its place"):
         compare_base([first, moved], BASE, largest_shift=1e-3)
     with pytest.raises(
-        DataFileError, match=r"swing\.c3d: base marker base 2 moved by 2\.00 mm against the other .*, check the unit,"
+        DataFileError,
+        match=r"swing\.c3d: base marker base 2 moved by 2\.00 mm against the other .*, "
+        r"check the unit,",
     ):
         compare_base([first, moved, bumped], BASE, 1e-3)
     compare_base([first, bumped], BASE, 5e-3)
@@ -231,7 +266,10 @@ DECAY = 4.0  # [1/s]
 # Nominal positions [m]: four markers on the clamp, three at the tip, in the order of the labels.
 SEGMENT_NOMINAL = np.array(
     [
-        *((-0.0505, -0.0205, 0.002), (-0.0305, -0.0505, 0.002), (-0.0105, 0.0505, 0.002), (-0.0505, 0.0235, 0.002)),
+        (-0.0505, -0.0205, 0.002),
+        (-0.0305, -0.0505, 0.002),
+        (-0.0105, 0.0505, 0.002),
+        (-0.0505, 0.0235, 0.002),
         *((-0.0096, -0.0265, -0.1), (-0.0096, 0.0265, -0.1), (-0.0282, 0.0, -0.1)),
     ]
 )
@@ -241,7 +279,9 @@ def swing(opening, amplitude=5e-3, frames=150, noise=5e-6, seed=0):
     """(T, 3) [m] a damped oscillator that a constant force acts on from an opening [s] on."""
     t = np.maximum(np.arange(frames) / RATE - opening, 0.0)
     turn = 2.0 * np.pi * 8.0
-    way = amplitude * (1.0 - np.exp(-DECAY * t) * (np.cos(turn * t) + DECAY / turn * np.sin(turn * t)))
+    way = amplitude * (
+        1.0 - np.exp(-DECAY * t) * (np.cos(turn * t) + DECAY / turn * np.sin(turn * t))
+    )
     still = np.random.default_rng(seed).normal(0.0, noise, (frames, 3))
     return way[:, None] * np.array([-0.8, 0.1, 0.6]) + still
 
@@ -288,11 +328,19 @@ def test_repeated_frames_are_masked():
 
 @pytest.fixture
 def published(tmp_path):
-    """Two trials in the layout that was published; which marker is which shows in the first frame."""
+    """Two trials in the layout that was published.
+
+    Which marker is which shows in the first frame.
+    """
     rest = np.empty((7, 3))
     rest[list(segment.MARKERS)] = SEGMENT_NOMINAL
-    moved = np.isin(np.arange(7), [segment.MARKERS[segment.SEGMENT_LABELS.index(name)] for name in segment.TIP_LABELS])
-    trials = [rest + moved[:, None] * swing(*own)[:, None] for own in ((0.0725, 2e-3), (0.12, 9e-3))]
+    moved = np.isin(
+        np.arange(7),
+        [segment.MARKERS[segment.SEGMENT_LABELS.index(name)] for name in segment.TIP_LABELS],
+    )
+    trials = [
+        rest + moved[:, None] * swing(*own)[:, None] for own in ((0.0725, 2e-3), (0.12, 9e-3))
+    ]
     noisy = np.stack(trials) + np.random.default_rng(1).normal(0.0, 5e-6, (2, 150, 7, 3))
     noisy[0, 40] = noisy[0, 39]
     arrays = {"pressure_mbar": np.array([50.0, 325.0]), "markers": noisy, "rate_hz": np.array(RATE)}
@@ -302,7 +350,10 @@ def published(tmp_path):
 
 def test_the_segment_is_converted(published, tmp_path):
     segment.convert_segment(published[0], tmp_path / "out")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["segment_050.h5", "segment_325.h5"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "segment_050.h5",
+        "segment_325.h5",
+    ]
     first = read_recording(tmp_path / "out" / "segment_050.h5")
     assert first.labels == segment.SEGMENT_LABELS
     assert first.start == pytest.approx(-0.0725, abs=2.5e-3)
@@ -327,7 +378,9 @@ def test_the_segment_is_converted(published, tmp_path):
 )
 def test_another_layout_is_refused(published, change, message):
     path, arrays = published
-    np.savez(path, **{name: array for name, array in {**arrays, **change}.items() if array is not None})
+    np.savez(
+        path, **{name: array for name, array in {**arrays, **change}.items() if array is not None}
+    )
     with pytest.raises(DataFileError, match=message) as refused:
         segment.read_published_segment(path)
     assert str(path) in str(refused.value)
@@ -345,7 +398,11 @@ def test_the_measured_segment(shared_data):
         opened = np.flatnonzero(trial.time >= 0.0)[0]
         early = np.nanmax(np.linalg.norm(tip.positions[:opened] - tip.rest, axis=2))
         assert early < 2e-4
-        ends.append(float(np.linalg.norm(np.nanmedian(tip.positions[-20:], axis=0).mean(0) - tip.rest.mean(0))))
+        ends.append(
+            float(
+                np.linalg.norm(np.nanmedian(tip.positions[-20:], axis=0).mean(0) - tip.rest.mean(0))
+            )
+        )
         clamp = trial.select(segment.BASE_LABELS)
         assert np.nanmax(np.linalg.norm(clamp.positions - clamp.rest, axis=2)) < 3e-4, mbar
     assert ends == sorted(ends)

@@ -22,16 +22,27 @@ def positions():
     return swing + np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.1]])
 
 
-def write_table(path, positions, *, stamps=None, first="time [s]", unit="mm", delimiter=",", extra=()):
+def write_table(
+    path, positions, *, stamps=None, first="time [s]", unit="mm", delimiter=",", extra=()
+):
     """A plain table in millimetres; a NaN becomes an empty cell."""
-    header = [first, *(f"{label}.{axis} [{unit}]" for label in "abc" for axis in "xyz"), *(name for name, _ in extra)]
+    header = [
+        first,
+        *(f"{label}.{axis} [{unit}]" for label in "abc" for axis in "xyz"),
+        *(name for name, _ in extra),
+    ]
     stamps = np.arange(len(positions)) / 100.0 if stamps is None else stamps
     with open(path, "w", newline="") as file:
         writer = csv.writer(file, delimiter=delimiter)
         writer.writerow(header)
         for frame, stamp in enumerate(stamps):
-            cells = ["" if np.isnan(value) else f"{1e3 * value:.6f}" for value in positions[frame].ravel()]
-            writer.writerow([f"{stamp:.4f}", *cells, *(f"{column[frame]:g}" for _, column in extra)])
+            cells = [
+                "" if np.isnan(value) else f"{1e3 * value:.6f}"
+                for value in positions[frame].ravel()
+            ]
+            writer.writerow(
+                [f"{stamp:.4f}", *cells, *(f"{column[frame]:g}" for _, column in extra)]
+            )
     return path
 
 
@@ -46,7 +57,9 @@ def edit(path, line, change):
 def test_table(tmp_path, positions, delimiter):
     positions[7:9, 1] = np.nan
     pressure = np.linspace(0.0, 39.0, 40)
-    path = write_table(tmp_path / "swing.csv", positions, delimiter=delimiter, extra=[("valve [mbar]", pressure)])
+    path = write_table(
+        tmp_path / "swing.csv", positions, delimiter=delimiter, extra=[("valve [mbar]", pressure)]
+    )
     recording = read_recording(path)
     assert recording.labels == ("a", "b", "c")
     assert recording.rate == 100.0
@@ -56,7 +69,9 @@ def test_table(tmp_path, positions, delimiter):
 
 
 def test_a_table_without_a_header(tmp_path, positions):
-    """As a log has it: no header, semicolons, columns of no interest, times in milliseconds, a tendon's length."""
+    """As a log has it: no header, semicolons, columns of no interest,
+    times in milliseconds, a tendon's length.
+    """
     path, wound = tmp_path / "swing.csv", np.linspace(0.0, 3.9, 40)
     rows = [[1000.0 + 10.0 * k, 7.0, *(1e3 * positions[k].ravel()), wound[k]] for k in range(40)]
     path.write_text("a log\n" + "\n".join(";".join(f"{x:.6f}" for x in row) for row in rows) + "\n")
@@ -70,18 +85,28 @@ def test_a_table_without_a_header(tmp_path, positions):
 
 
 class TestALogThatBeganBeforeItsWinch:
-    """Missing first values equal the first known one, the recording ends with the last one; notes are ignored."""
+    """Missing first values equal the first known one, the recording ends with the last one.
 
-    COLUMNS = ("frame", *(f"{label}.{axis}" for label in "abc" for axis in "xyz"), "winch [mm]", "valve [Pa]")
+    Notes are ignored.
+    """
+
+    COLUMNS = (
+        "frame",
+        *(f"{label}.{axis}" for label in "abc" for axis in "xyz"),
+        "winch [mm]",
+        "valve [Pa]",
+    )
     TABLE = TableSettings(columns=COLUMNS, header_lines=1)
     GONE = float("nan")
 
     def write(self, path, positions, winch, valve, ends=",,"):
-        rows = [
-            f"{k},{','.join(f'{x:.6f}' for x in positions[k].ravel())},{winch[k]:.6f},{valve[k]:.6f}{ends}"
-            for k in range(40)
-        ]
-        path.write_text("\n".join([",".join(self.COLUMNS) + ",,from left to right", *rows]).replace("nan", ""))
+        rows = []
+        for k in range(40):
+            values = [*positions[k].ravel(), winch[k], valve[k]]
+            rows.append(f"{k},{','.join(f'{x:.6f}' for x in values)}{ends}")
+        path.write_text(
+            "\n".join([",".join(self.COLUMNS) + ",,from left to right", *rows]).replace("nan", "")
+        )
         return path
 
     def read(self, path):
@@ -92,12 +117,16 @@ class TestALogThatBeganBeforeItsWinch:
         winch = np.where((np.arange(40) < 5) | (np.arange(40) >= 35), np.nan, pulled)
         recording = self.read(self.write(tmp_path / "swing.csv", positions, winch, valve))
         assert recording.positions.shape == (35, 3, 3)
-        np.testing.assert_allclose(recording.actuation[:, 0], 1e-3 * pulled[np.clip(np.arange(35), 5, None)], atol=1e-9)
+        np.testing.assert_allclose(
+            recording.actuation[:, 0], 1e-3 * pulled[np.clip(np.arange(35), 5, None)], atol=1e-9
+        )
         np.testing.assert_array_equal(recording.actuation[:, 1], valve[:35])  # as it was logged
         assert "in its first 5 frames" in caplog.text
         assert "its last 5, which are left out" in caplog.text
 
-    def test_a_gap_an_infinity_and_a_channel_that_ends_at_once_are_refused(self, tmp_path, positions):
+    def test_a_gap_an_infinity_and_a_channel_that_ends_at_once_are_refused(
+        self, tmp_path, positions
+    ):
         whole, numbers = np.linspace(2.0, 3.5, 40), np.arange(40)
         path = tmp_path / "swing.csv"
         for value in (np.nan, np.inf):
@@ -131,14 +160,20 @@ def test_wrong_descriptions_of_tables(tmp_path, columns, lines, message):
     path = tmp_path / "swing.csv"
     np.savetxt(path, np.arange(40.0).reshape(10, 4), delimiter=",")
     with pytest.raises(DataFileError, match=message):
-        read_recording(path, units="mm", rate=60.0, table=TableSettings(columns=columns, header_lines=lines))
+        read_recording(
+            path, units="mm", rate=60.0, table=TableSettings(columns=columns, header_lines=lines)
+        )
     with pytest.raises(DataFileError, match=r"data\.table"):
-        read_recording(tmp_path / "swing.npz", table=TableSettings(columns=columns, header_lines=lines))
+        read_recording(
+            tmp_path / "swing.npz", table=TableSettings(columns=columns, header_lines=lines)
+        )
 
 
 def test_lines_that_were_not_recorded_are_occlusions(tmp_path, positions):
     stamps = np.delete(np.arange(40), [10, 11, 12]) / 120.0
-    path = write_table(tmp_path / "swing.csv", np.delete(positions, [10, 11, 12], axis=0), stamps=stamps + 3.0)
+    path = write_table(
+        tmp_path / "swing.csv", np.delete(positions, [10, 11, 12], axis=0), stamps=stamps + 3.0
+    )
     recording = read_recording(path)
     assert recording.rate == 120.0  # although times were rounded to 0.1 ms
     assert recording.start == pytest.approx(3.0)
@@ -146,11 +181,20 @@ def test_lines_that_were_not_recorded_are_occlusions(tmp_path, positions):
     np.testing.assert_allclose(recording.positions[13:], positions[13:], atol=1e-9)
 
 
-@pytest.mark.parametrize(("rate", "decimals"), [(30.0, 2), (59.94, 3), (119.88, 4), (120.0, 3), (240.0, 3), (300.0, 3)])
+@pytest.mark.parametrize(
+    ("rate", "decimals"), [(30.0, 2), (59.94, 3), (119.88, 4), (120.0, 3), (240.0, 3), (300.0, 3)]
+)
 def test_rounded_times_give_the_rate_whatever_frames_are_missing(tmp_path, rate, decimals):
     frames = np.delete(np.arange(1500), [10, 300, 301, 302, *range(700, 800)])
     table = np.column_stack([np.round(frames / rate + 2.0, decimals), frames, frames, frames])
-    np.savetxt(tmp_path / "swing.csv", table, "%.8g", ",", header="time [s],a.x [mm],a.y [mm],a.z [mm]", comments="")
+    np.savetxt(
+        tmp_path / "swing.csv",
+        table,
+        "%.8g",
+        ",",
+        header="time [s],a.x [mm],a.y [mm],a.z [mm]",
+        comments="",
+    )
     recording = read_recording(tmp_path / "swing.csv")
     assert recording.rate == pytest.approx(rate, rel=2e-5)
     np.testing.assert_array_equal(np.flatnonzero(recording.seen[:, 0]), frames)
@@ -172,7 +216,8 @@ def test_rounded_times_give_the_rate_whatever_frames_are_missing(tmp_path, rate,
         (7, lambda line: "0.0540" + line[6:], "line 7"),
         (8, lambda line: "0.0100" + line[6:], "line 8: the time or frame does not rise"),
         (8, lambda line: "1e308" + line[6:], "line 8"),
-        (1, lambda line: line.replace("b.y", "b" + 20_000 * " " + "y"), "column 6 is named"),  # not in cubic time
+        # Not in cubic time.
+        (1, lambda line: line.replace("b.y", "b" + 20_000 * " " + "y"), "column 6 is named"),
     ],
 )
 def test_errors_of_tables_name_line_and_column(tmp_path, positions, line, change, message):
@@ -190,18 +235,33 @@ def test_times_that_are_too_close_are_refused(tmp_path, positions, stamps):
     path = write_table(tmp_path / "swing.csv", positions)
     for line, stamp in enumerate(stamps, start=2):
         edit(path, line, lambda text, stamp=float(stamp): f"{stamp!r}{text[6:]}")
-    refuses(DataFileError, r"a frame rate of inf|do not belong to one recording|does not rise", read_recording, path)
+    refuses(
+        DataFileError,
+        r"a frame rate of inf|do not belong to one recording|does not rise",
+        read_recording,
+        path,
+    )
 
 
 def archive(path, positions, **changes):
-    content = {"positions": positions, "labels": np.array(["a", "b", "c"]), "rate_hz": 100.0, **changes}
+    content = {
+        "positions": positions,
+        "labels": np.array(["a", "b", "c"]),
+        "rate_hz": 100.0,
+        **changes,
+    }
     np.savez(path, **{name: value for name, value in content.items() if value is not None})
     return path
 
 
 def test_numpy_archive(tmp_path, positions):
     pressure = np.ones((40, 2))
-    more = {"units": "mm", "actuation": pressure, "actuation_units": "kPa", "rest": 1e3 * positions[0]}
+    more = {
+        "units": "mm",
+        "actuation": pressure,
+        "actuation_units": "kPa",
+        "rest": 1e3 * positions[0],
+    }
     path = archive(tmp_path / "swing.npz", 1e3 * positions, **more)
     recording = read_recording(path)
     np.testing.assert_allclose(recording.positions, positions)
@@ -222,7 +282,10 @@ def test_numpy_archive(tmp_path, positions):
         ({"rate_hz": None}, "does not say how many frames a second"),
         ({"rate_hz": -1.0}, "frame rate of -1"),
         ({"positions": None}, "has no array 'positions'"),
-        ({"positions": np.zeros((40, 9))}, r"positions must be \(frames, markers, 3\), not \(40, 9\)"),
+        (
+            {"positions": np.zeros((40, 9))},
+            r"positions must be \(frames, markers, 3\), not \(40, 9\)",
+        ),
         ({"positions": np.full((40, 3, 3), np.nan)}, "no marker is seen in any frame"),
         ({"labels": np.array(["a", "b"])}, "has 3 markers and 2 labels"),
         ({"units": "ft"}, "gives positions in 'ft'"),
@@ -230,15 +293,30 @@ def test_numpy_archive(tmp_path, positions):
             {"units": "cm", "positions": np.random.default_rng(0).normal(size=(40, 3, 3)) * 1e5},
             "markers span .* set units to it",
         ),
-        ({"positions": np.random.default_rng(0).normal(size=(40, 3, 3)) * 1e-6}, "all markers lie within"),
-        ({"actuation": np.zeros((39, 2))}, r"actuation has the shape \(39, 2\).* each of the 40 frames"),
+        (
+            {"positions": np.random.default_rng(0).normal(size=(40, 3, 3)) * 1e-6},
+            "all markers lie within",
+        ),
+        (
+            {"actuation": np.zeros((39, 2))},
+            r"actuation has the shape \(39, 2\).* each of the 40 frames",
+        ),
         ({"actuation": np.full((40, 2), np.nan)}, "an actuation is NaN"),
-        ({"base": np.ones((40, 6))}, r"base has the shape \(40, 6\); it needs a place and a quaternion"),
-        ({"actuation": np.zeros((40, 2)), "actuation_units": "psi"}, "gives its actuation in 'psi'"),
+        (
+            {"base": np.ones((40, 6))},
+            r"base has the shape \(40, 6\); it needs a place and a quaternion",
+        ),
+        (
+            {"actuation": np.zeros((40, 2)), "actuation_units": "psi"},
+            "gives its actuation in 'psi'",
+        ),
         ({"rest": np.zeros((2, 3))}, r"rest has the shape \(2, 3\)"),
         ({"start": np.inf}, "its first frame is at inf s"),
         ({"rate_hz": np.full(40, 100.0)}, r"'rate_hz' has the shape \(40,\)"),
-        ({"actuation": np.full((40, 2), 1e308), "actuation_units": "bar"}, "an actuation is NaN or infinite"),
+        (
+            {"actuation": np.full((40, 2), 1e308), "actuation_units": "bar"},
+            "an actuation is NaN or infinite",
+        ),
     ],
 )
 def test_wrong_archives(tmp_path, positions, changes, message):
@@ -251,10 +329,18 @@ def test_arrays_larger_than_any_recording_are_not_read(tmp_path, positions, monk
     zeros = np.zeros((200_000, 3, 3))  # 14 MB, of which little is left in the file
     np.savez_compressed(tmp_path / "swing.npz", positions=zeros, rate_hz=100.0)
     assert (tmp_path / "swing.npz").stat().st_size < 1 << 20
-    refuses(DataFileError, r"swing\.npz .* \(its arrays are larger than", read_recording, tmp_path / "swing.npz")
+    refuses(
+        DataFileError,
+        r"swing\.npz .* \(its arrays are larger than",
+        read_recording,
+        tmp_path / "swing.npz",
+    )
     with h5py.File(tmp_path / "swing.h5", "w") as file:
-        file.create_dataset("positions", (1 << 40, 3, 3), "f8", chunks=(64, 3, 3))  # nothing of it in the file
-    with pytest.raises(DataFileError, match=r"swing\.h5 is damaged \(it takes more than 2048 MiB of memory\)"):
+        # Nothing of it in the file.
+        file.create_dataset("positions", (1 << 40, 3, 3), "f8", chunks=(64, 3, 3))
+    with pytest.raises(
+        DataFileError, match=r"swing\.h5 is damaged \(it takes more than 2048 MiB of memory\)"
+    ):
         read_recording(tmp_path / "swing.h5")
 
 
@@ -269,7 +355,11 @@ class Payload:
 
 
 def test_objects_in_an_archive_are_refused_and_not_run(tmp_path, positions):
-    path = archive(tmp_path / "swing.npz", positions, labels=np.array([Payload(tmp_path / "ran")], dtype=object))
+    path = archive(
+        tmp_path / "swing.npz",
+        positions,
+        labels=np.array([Payload(tmp_path / "ran")], dtype=object),
+    )
     refuses(DataFileError, "Python objects", read_recording, path)
     (tmp_path / "bare.npz").write_bytes(pickle.dumps(Payload(tmp_path / "ran")))
     refuses(DataFileError, "Python objects", read_recording, tmp_path / "bare.npz")
@@ -279,7 +369,12 @@ def test_objects_in_an_archive_are_refused_and_not_run(tmp_path, positions):
 def test_damaged_and_foreign_files(tmp_path, positions):
     whole = archive(tmp_path / "swing.npz", positions).read_bytes()
     (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
-    refuses(DataFileError, r"cut\.npz is not a NumPy file of plain arrays", read_recording, tmp_path / "cut.npz")
+    refuses(
+        DataFileError,
+        r"cut\.npz is not a NumPy file of plain arrays",
+        read_recording,
+        tmp_path / "cut.npz",
+    )
     np.save(tmp_path / "single.npy", positions)
     (tmp_path / "single.npy").rename(tmp_path / "single.npz")
     refuses(DataFileError, "is a single array", read_recording, tmp_path / "single.npz")
@@ -287,7 +382,9 @@ def test_damaged_and_foreign_files(tmp_path, positions):
         refuses(DataFileError, r"No such file|does not exist", read_recording, tmp_path / name)
     (tmp_path / "empty.csv").touch()
     refuses(DataFileError, "has no header that is known", read_recording, tmp_path / "empty.csv")
-    refuses(DataFileError, "is no recording that can be read", read_recording, tmp_path / "swing.mat")
+    refuses(
+        DataFileError, "is no recording that can be read", read_recording, tmp_path / "swing.mat"
+    )
 
 
 def test_arguments_are_checked(tmp_path, positions):
@@ -320,7 +417,9 @@ def test_hdf5_gives_back_what_was_written(tmp_path, positions):
 
 
 def plate(count=20):
-    """(T, 3) and (T, 4) a rigid body that moves and turns, and the points on its axes (T, 3, 3), in m."""
+    """(T, 3) and (T, 4) a rigid body that moves and turns,
+    and the points on its axes (T, 3, 3), in m.
+    """
     turn = Rotation.from_rotvec(np.linspace(0.0, 2.5, count)[:, None] * [0.6, 0.0, 0.8])
     place = np.linspace([0.0, 0.0, 0.0], [0.1, -0.05, 0.02], count)
     arms = place[:, None] + 0.05 * np.stack([turn.apply(axis) for axis in np.eye(3)], axis=1)

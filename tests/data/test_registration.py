@@ -23,7 +23,9 @@ BEAM = {
 }
 NAMES, NOMINAL = list(BEAM), np.array(list(BEAM.values()))
 BASE = NAMES[3:]
-MOTION = RigidTransform(Rotation.from_euler("xyz", [0.4, -2.0, 1.1]).as_matrix(), np.array([0.3, -0.2, 1.5]))
+MOTION = RigidTransform(
+    Rotation.from_euler("xyz", [0.4, -2.0, 1.1]).as_matrix(), np.array([0.3, -0.2, 1.5])
+)
 SOURCE = "swing.c3d"
 
 
@@ -37,7 +39,9 @@ def measured(motion=MOTION, **moved):
 
 def assert_inverse(result, atol=1e-12):
     np.testing.assert_allclose(result.rotation @ MOTION.rotation, np.eye(3), rtol=0, atol=atol)
-    np.testing.assert_allclose(result.rotation @ MOTION.translation + result.translation, 0.0, atol=atol)
+    np.testing.assert_allclose(
+        result.rotation @ MOTION.translation + result.translation, 0.0, atol=atol
+    )
 
 
 def test_kabsch_finds_a_batch_of_rigid_motions():
@@ -74,7 +78,9 @@ class TestRegisterMarkers:
         points = measured(m0=[0, 0, -0.01], m1=[0, 0, -0.01], m2=[0, 0, -0.012])
         result = register_markers(points, NOMINAL, NAMES, source=SOURCE, use=BASE)
         assert_inverse(result.transform)
-        np.testing.assert_allclose(result.residual, [0.01, 0.01, 0.012, 0, 0, 0], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(
+            result.residual, [0.01, 0.01, 0.012, 0, 0, 0], rtol=0, atol=1e-12
+        )
         assert list(result.inliers) == [False] * 3 + [True] * 3
         assert result.outliers == ()
         points = measured()
@@ -89,13 +95,19 @@ class TestRegisterMarkers:
     @pytest.mark.parametrize(
         ("points", "settings", "sentence"),
         [
-            (measured(m1=[0.1, 0.0, 0.0]), {"use": NAMES[:4]}, "'Tip - 2'"),  # of four, none can be left out
-            (measured(m1=[0.1, 0.0, 0.0], m4=[0.0, 0.05, 0.0], m5=[0.03, 0.0, 0.0]), {}, "'Tip - 2' is "),
+            # Of four, none can be left out.
+            (measured(m1=[0.1, 0.0, 0.0]), {"use": NAMES[:4]}, "'Tip - 2'"),
+            (
+                measured(m1=[0.1, 0.0, 0.0], m4=[0.0, 0.05, 0.0], m5=[0.03, 0.0, 0.0]),
+                {},
+                "'Tip - 2' is ",
+            ),
             (measured(m3=[0.0, 0.03, 0.0]), {"use": BASE}, "mm off (all three: "),
             (
                 np.where(np.arange(6)[:, None] > 3, np.nan, measured()),
                 {"use": BASE},
-                "registration needs three markers at rest, but 1 are left to it; not seen: 'Base - 2', 'Base - 3'.",
+                "registration needs three markers at rest, but 1 are left to it; not seen: 'Base "
+                "- 2', 'Base - 3'.",
             ),
         ],
     )
@@ -107,14 +119,27 @@ class TestRegisterMarkers:
     def test_base_markers_on_a_line_wrong_names_and_shapes_are_refused(self):
         nominal = NOMINAL.copy()
         nominal[3:] = [[0.0, 0.0, 0.0], [0.0, 0.02, 0.001], [0.0, 0.05, 0.0]]
-        with pytest.raises(InputError, match="'Base - 1', 'Base - 2', 'Base - 3' lie on one line to within 4"):
+        with pytest.raises(
+            InputError, match="'Base - 1', 'Base - 2', 'Base - 3' lie on one line to within 4"
+        ):
             register_markers(MOTION.apply(nominal), nominal, NAMES, source=SOURCE, use=BASE)
-        refuses(InputError, "'Base - 9'", register_markers, measured(), NOMINAL, NAMES, source=SOURCE, use=["Base - 9"])
+        refuses(
+            InputError,
+            "'Base - 9'",
+            register_markers,
+            measured(),
+            NOMINAL,
+            NAMES,
+            source=SOURCE,
+            use=["Base - 9"],
+        )
         with pytest.raises(InputError, match="6 markers are named, with measured positions"):
             register_markers(measured()[:5], NOMINAL, NAMES, source=SOURCE)
 
 
-@pytest.mark.parametrize(("name", "rms"), [("gravity", 0.807e-3), ("load101", 1.132e-3)], ids=["bare", "101g"])
+@pytest.mark.parametrize(
+    ("name", "rms"), [("gravity", 0.807e-3), ("load101", 1.132e-3)], ids=["bare", "101g"]
+)
 def test_recordings_of_the_beam(shared_data, name, rms):
     recording = read_recording(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d").select(NAMES)
     positions = fill_gaps(recording, 5).positions
@@ -130,7 +155,10 @@ def test_recordings_of_the_beam(shared_data, name, rms):
     assert np.linalg.norm(without.positions - result.positions, axis=1)[:3].max() < 2.5e-3
 
 
-MESHES = {"hexahedra": box_hexahedra(divisions=(5, 2, 2)), "tetrahedra10": box_tetrahedra(divisions=(5, 2, 2), order=2)}
+MESHES = {
+    "hexahedra": box_hexahedra(divisions=(5, 2, 2)),
+    "tetrahedra10": box_tetrahedra(divisions=(5, 2, 2), order=2),
+}
 
 
 @pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES.keys())
@@ -141,8 +169,12 @@ def test_closest_points_of_a_box(mesh):
     outside = np.linalg.norm(np.maximum(np.maximum(-points, points - high), 0.0), axis=1)
     inside = np.minimum(points, high - points).min(axis=1)
     result = closest_points(mesh, points)
-    np.testing.assert_allclose(result.distances, np.where(outside > 0.0, outside, -inside), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(points - result.points, axis=1), np.abs(result.distances), atol=1e-12)
+    np.testing.assert_allclose(
+        result.distances, np.where(outside > 0.0, outside, -inside), rtol=0, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        np.linalg.norm(points - result.points, axis=1), np.abs(result.distances), atol=1e-12
+    )
     corners = mesh.vertices[result.triangles]
     heights = np.einsum("pki,pi->pk", corners - result.points[:, None], result.normals)
     np.testing.assert_allclose(heights, 0.0, atol=1e-12)
@@ -167,9 +199,15 @@ def test_known_axes_leave_a_shift_that_one_marker_determines_and_have_to_fit():
     assert result.outliers == ("Base - 1",)
     np.testing.assert_allclose(result.residual[[3]], 0.02, atol=3e-4)
     points, rotation = shifted(["y", "-x", "z"])
-    with pytest.raises(DataFileError, match=r"swing.c3d: .* with the axes that are given: '[A-Z].*' is .* mm off"):
-        register_markers(points, NOMINAL, NAMES, source=SOURCE, rotation=axes_rotation(["z", "x", "y"]))
-    with pytest.raises(DataFileError, match="registration needs one marker at rest, but 0 are left to it"):
+    with pytest.raises(
+        DataFileError, match=r"swing.c3d: .* with the axes that are given: '[A-Z].*' is .* mm off"
+    ):
+        register_markers(
+            points, NOMINAL, NAMES, source=SOURCE, rotation=axes_rotation(["z", "x", "y"])
+        )
+    with pytest.raises(
+        DataFileError, match="registration needs one marker at rest, but 0 are left to it"
+    ):
         register_markers(points * np.nan, NOMINAL, NAMES, source=SOURCE, rotation=rotation)
     refuses(InputError, "would mirror the recording", axes_rotation, ["x", "z", "y"])
     refuses(InputError, "name one axis twice", axes_rotation, ["x", "-x", "y"])
@@ -189,7 +227,11 @@ class TestWithAKnownVertical:
         return register_markers(measured, nominal, names, source=SOURCE, vertical=vertical), turn
 
     @pytest.mark.parametrize(
-        "nominal", [[[0.1, 0.0, 0.02], [-0.1, 0.03, 0.0]], [[0.0, 0.0, 0.0], [0.05, 0.0, 0.1], [0.1, 0.0, 0.2]]]
+        "nominal",
+        [
+            [[0.1, 0.0, 0.02], [-0.1, 0.03, 0.0]],
+            [[0.0, 0.0, 0.0], [0.05, 0.0, 0.1], [0.1, 0.0, 0.2]],
+        ],
     )
     def test_two_markers_or_a_row_register_with_a_known_vertical(self, nominal):
         result, turn = self.register(np.array(nominal))
@@ -200,15 +242,29 @@ class TestWithAKnownVertical:
         with pytest.raises(InputError, match=r"'B0', 'B1' lie above one another to within 4\.0 mm"):
             self.register(np.array([[0.0, 0.0, 0.0], [0.001, 0.0, 0.3]]))
         pair = np.array([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]])
-        with pytest.raises(DataFileError, match=r"with the vertical that is given: 'B[01]' is 20\.0 mm off"):
-            register_markers(pair * 1.2, pair, ["B0", "B1"], source=SOURCE, vertical=(self.UP, self.UP))
+        with pytest.raises(
+            DataFileError, match=r"with the vertical that is given: 'B[01]' is 20\.0 mm off"
+        ):
+            register_markers(
+                pair * 1.2, pair, ["B0", "B1"], source=SOURCE, vertical=(self.UP, self.UP)
+            )
         hidden = np.array([[0.1, 0.0, 0.0], [np.nan] * 3])
-        with pytest.raises(DataFileError, match="registration needs two markers at rest, but 1 are left"):
+        with pytest.raises(
+            DataFileError, match="registration needs two markers at rest, but 1 are left"
+        ):
             register_markers(hidden, pair, ["B0", "B1"], source=SOURCE, vertical=(self.UP, self.UP))
 
 
 LETTERS = ("a", "b", "c", "d", "base")
-PLACES = np.array([[0.0, 0.0, -0.1], [0.03, 0.0, -0.2], [-0.02, 0.01, -0.3], [0.0, 0.0, -0.37], [0.04, 0.02, 0.01]])
+PLACES = np.array(
+    [
+        [0.0, 0.0, -0.1],
+        [0.03, 0.0, -0.2],
+        [-0.02, 0.01, -0.3],
+        [0.0, 0.0, -0.37],
+        [0.04, 0.02, 0.01],
+    ]
+)
 TURN = Rotation.from_euler("xyz", [40.0, -70.0, 120.0], degrees=True).as_matrix()
 SHIFT = np.array([0.3, -1.2, 0.7])
 ORDER = np.array([3, 0, 4, 1, 2])  # of the file
@@ -223,25 +279,37 @@ def seen(places=PLACES, noise=0.0, turn=TURN):
 @pytest.mark.parametrize(("noise", "extra"), [(0.0, 0), (3e-3, 2)])
 def test_markers_are_named_in_any_order_and_frame(noise, extra):
     others = np.random.default_rng(1).uniform(-1.0, 1.0, (extra, 3))
-    columns, motion, rms, next_rms = assign(np.concatenate([others, seen(noise=noise)]), PLACES, LETTERS, source="file")
+    columns, motion, rms, next_rms = assign(
+        np.concatenate([others, seen(noise=noise)]), PLACES, LETTERS, source="file"
+    )
     np.testing.assert_array_equal(columns, extra + np.argsort(ORDER))
     np.testing.assert_allclose(motion.rotation, TURN, atol=30.0 * noise + 1e-9)
     assert rms <= 2.0 * noise + 1e-9 < next_rms
 
 
 def test_one_anchor_is_enough_with_known_axes():
-    """The others may be centimetres from where they are expected, as on a body of unknown stiffness."""
-    moved = PLACES + np.array([[0.0, 0.005, 0.0], [0.01, 0.02, 0.0], [0.01, 0.03, 0.01], [0.02, 0.04, 0.02], [0, 0, 0]])
-    columns, motion, *_ = assign(seen(moved), PLACES, LETTERS, source="file", anchors=[4], rotation=TURN)
+    """The others may be centimetres from where they are expected,
+    as on a body of unknown stiffness.
+    """
+    moved = PLACES + np.array(
+        [[0.0, 0.005, 0.0], [0.01, 0.02, 0.0], [0.01, 0.03, 0.01], [0.02, 0.04, 0.02], [0, 0, 0]]
+    )
+    columns, motion, *_ = assign(
+        seen(moved), PLACES, LETTERS, source="file", anchors=[4], rotation=TURN
+    )
     np.testing.assert_array_equal(columns, np.argsort(ORDER))
     np.testing.assert_allclose(motion.translation, SHIFT, atol=1e-9)
 
 
 def test_ambiguous_markers_are_named_and_ambiguous_assignments_refused():
-    places = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.1, 0.1, 0.0]])  # a square
-    with pytest.raises(DataFileError, match=r"swing.csv: which of its markers is which is not clear: .* 'a', "):
+    # a square
+    places = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.1, 0.1, 0.0]])
+    with pytest.raises(
+        DataFileError, match=r"swing.csv: which of its markers is which is not clear: .* 'a', "
+    ):
         assign(places @ TURN, places, LETTERS[:4], source="swing.csv")
-    turned = np.concatenate([places[[2, 0]], [[0.5, 0.5, 0.0]], places[[1, 3]]])  # and a foreign one
+    # And a foreign one.
+    turned = np.concatenate([places[[2, 0]], [[0.5, 0.5, 0.0]], places[[1, 3]]])
     with pytest.raises(DataFileError) as refused:
         assign(turned @ TURN, places, LETTERS[:4], source="swing.csv")
     (pasted,) = re.findall(r"labels: \[(.*)\]\.", str(refused.value))
@@ -249,8 +317,18 @@ def test_ambiguous_markers_are_named_and_ambiguous_assignments_refused():
     assert sorted(pasted.split(", ")) == sorted([*LETTERS[:4], "other_3"])
     hidden = seen()
     hidden[1] = np.nan
-    refuses(DataFileError, "file shows 4 markers, and 5 are configured", assign, hidden, PLACES, LETTERS, source="file")
-    with pytest.raises(InputError, match=r"2 markers stand still, and it takes three .* or data.axes"):
+    refuses(
+        DataFileError,
+        "file shows 4 markers, and 5 are configured",
+        assign,
+        hidden,
+        PLACES,
+        LETTERS,
+        source="file",
+    )
+    with pytest.raises(
+        InputError, match=r"2 markers stand still, and it takes three .* or data.axes"
+    ):
         assign(seen(), PLACES, LETTERS, source="file", anchors=[3, 4])
     with pytest.raises(InputError, match="configure one at least"):
         assign(seen(), PLACES, LETTERS, source="file", anchors=[], rotation=TURN)

@@ -1,4 +1,6 @@
-"""Kept factors: in single precision, rotated with the body, and preconditioning adjoints of other states."""
+"""Kept factors: in single precision, rotated with the body,
+and preconditioning adjoints of other states.
+"""
 
 import math
 from types import SimpleNamespace
@@ -8,21 +10,35 @@ import pytest
 import torch
 
 from support.clamped import clamped, noise
-from warp_resphys import Corotated, Inputs, Mesh, Rigid, Simulator, SolverSettings, State, Tendons, box_hexahedra
+from warp_resphys import (
+    Corotated,
+    Inputs,
+    Mesh,
+    Rigid,
+    Simulator,
+    SolverSettings,
+    State,
+    Tendons,
+    box_hexahedra,
+)
 from warp_resphys.dynamics import equilibrium, kept_factor
 from warp_resphys.dynamics.kept_factor import Corotation
 from warp_resphys.fem.coordinates import SymmetryPlane
 from warp_resphys.linalg.pardiso import PardisoSolver, has_pardiso
 from warp_resphys.mesh.boxes import box_tetrahedra
 
-pytestmark = pytest.mark.skipif(not has_pardiso(), reason="needs the package mkl, which x86 processors alone have")
+pytestmark = pytest.mark.skipif(
+    not has_pardiso(), reason="needs the package mkl, which x86 processors alone have"
+)
 
 BOX = box_hexahedra((0.06, 0.04, 0.04), (4, 3, 3))
 CAP = np.flatnonzero(BOX.vertices[BOX.cells].mean(1)[:, 0] > 0.045)
 BODIES = {
     "hexahedra": clamped(BOX),
     "tetrahedra": clamped(box_tetrahedra((0.06, 0.04, 0.04), (4, 3, 3))),
-    "rigid part": clamped(Mesh(BOX.vertices, BOX.cells, {"cap": CAP}), rigid={"cap": Rigid(density=1200.0)}),
+    "rigid part": clamped(
+        Mesh(BOX.vertices, BOX.cells, {"cap": CAP}), rigid={"cap": Rigid(density=1200.0)}
+    ),
     "tendon": clamped(BOX, energies=[Tendons([[[0.0, 0.01, 0.04], [0.06, 0.01, 0.04]]], 400.0)]),
     "symmetry": clamped(BOX, symmetry=[SymmetryPlane((0.0, 1.0, 0.0), 0.0)]),
 }
@@ -30,7 +46,9 @@ BODIES = {
 
 def simulator(kind, linear_solver, poissons_ratio=0.45, youngs_modulus=264e3, **options):
     solver = SolverSettings(linear_solver=linear_solver, **{"relative_tolerance": 1e-10, **options})
-    return Simulator(BODIES[kind], Corotated(youngs_modulus, poissons_ratio, density=1070.0), solver=solver)
+    return Simulator(
+        BODIES[kind], Corotated(youngs_modulus, poissons_ratio, density=1070.0), solver=solver
+    )
 
 
 def turned(angle):
@@ -39,7 +57,9 @@ def turned(angle):
 
 
 def adjoints(sim, states, monkeypatch):
-    """Adjoints of a random gradient at states, one after another, and the factors and iterations that they took."""
+    """Adjoints of a random gradient at states, one after another,
+    and the factors and iterations that they took.
+    """
     counts = SimpleNamespace(factors=0, iterations=[])
     factor, iterate = PardisoSolver.direction_factor, kept_factor.conjugate_gradients
 
@@ -165,7 +185,11 @@ def test_roll_outs_and_gradients_agree_with_those_of_the_banded_solver(kind, nam
         sim = simulator(kind, linear_solver, poissons_ratio, youngs_modulus=1e4, name=name)
         rest = sim.rest_state()
         q = rest.q.clone().requires_grad_(True)
-        inputs = Inputs(tendon_tension=torch.tensor([[0.3]], dtype=torch.float64)) if kind == "tendon" else Inputs()
+        inputs = (
+            Inputs(tendon_tension=torch.tensor([[0.3]], dtype=torch.float64))
+            if kind == "tendon"
+            else Inputs()
+        )
         end = sim.rollout(State(q, rest.v), 8, inputs)
         gradient = torch.autograd.grad(end.q[-1].square().sum() + end.v[-1].sum(), q)[0]
         ends.append((end.q[-1].detach(), gradient))

@@ -8,12 +8,26 @@ import torch
 
 from support.clamped import clamped, noise
 from support.slopes import check_rows, check_slopes
-from warp_resphys import Corotated, Simulator, SolverSettings, StableNeoHookean, State, box_hexahedra, box_tetrahedra
+from warp_resphys import (
+    Corotated,
+    Simulator,
+    SolverSettings,
+    StableNeoHookean,
+    State,
+    box_hexahedra,
+    box_tetrahedra,
+)
 from warp_resphys.dynamics.hessian import ExactHessian
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.integrators import INTEGRATORS
 from warp_resphys.stepping.quantity import Quantity
-from warp_resphys.studies.gradient_check import POSES, GradientRow, central_difference, check_gradients, pose
+from warp_resphys.studies.gradient_check import (
+    POSES,
+    GradientRow,
+    central_difference,
+    check_gradients,
+    pose,
+)
 
 SIZE = (0.06, 0.02, 0.02)
 MESHES = {
@@ -27,8 +41,14 @@ TIGHT = SolverSettings(name="newton", relative_tolerance=1e-12)
 PER_ELEMENT = ("", ", each element", ", each environment")
 KINDS = [
     *("q", "v", "external_force", "fixed_positions", "attached_mass"),
-    *(f"{name}{kind}" for name in ("youngs_modulus", "poissons_ratio", "density") for kind in PER_ELEMENT),
-    *("mass_damping, each environment", "stiffness_damping, each environment", "gravity, each environment"),
+    *(
+        f"{name}{kind}"
+        for name in ("youngs_modulus", "poissons_ratio", "density")
+        for kind in PER_ELEMENT
+    ),
+    "mass_damping, each environment",
+    "stiffness_damping, each environment",
+    "gravity, each environment",
 ]
 
 
@@ -53,9 +73,13 @@ def test_single_precision_needs_no_factor_in_double(monkeypatch):
     """Not even where inertia is so small that rounding leaves more than is aimed at."""
     tried = []
     refactor = ExactHessian.refactor_exact
-    monkeypatch.setattr(ExactHessian, "refactor_exact", lambda self: (tried.append(self.exact), refactor(self)))
+    monkeypatch.setattr(
+        ExactHessian, "refactor_exact", lambda self: (tried.append(self.exact), refactor(self))
+    )
     sim = simulator(
-        material=replace(DAMPED, poissons_ratio=0.499), time_step=1.0, solver=TIGHT.changed(factors="single")
+        material=replace(DAMPED, poissons_ratio=0.499),
+        time_step=1.0,
+        solver=TIGHT.changed(factors="single"),
     )
     state = pose(sim, "bent", 2)
     q = state.q.clone().requires_grad_(True)
@@ -80,7 +104,9 @@ def test_every_parameter_at_every_pose(kind, start, poissons_ratio, device):
     assert_equal(check_gradients(simulator(kind, material, device=device), start, steps=2))
 
 
-@pytest.mark.parametrize(("integrator", "start"), [*zip([*INTEGRATORS][1:], ["bent", "twisted"], strict=True)])
+@pytest.mark.parametrize(
+    ("integrator", "start"), [*zip([*INTEGRATORS][1:], ["bent", "twisted"], strict=True)]
+)
 def test_every_parameter_with_every_integrator(integrator, start):
     assert_equal(check_gradients(simulator(integrator=integrator), start, steps=3))
 
@@ -114,11 +140,15 @@ def test_a_wrong_derivative_shows_in_all_rows_of_its_shape(monkeypatch):
 
 @pytest.mark.parametrize(("scale", "rounding"), [(1.0, 0.0), (3.0, 1e-12), (3.0, 1e-9)])
 def test_a_difference_is_as_good_as_rounding_allows_and_says_how_good(scale, rounding):
-    """A function whose values are off at random by a given amount, with a pole near the first step."""
+    """A function whose values are off at random by a given amount,
+    with a pole near the first step.
+    """
     random = torch.Generator().manual_seed(0)
 
     def function(step):
-        return math.exp(scale * step) / (3.5 + scale * step) + rounding * float(torch.randn(1, generator=random))
+        return math.exp(scale * step) / (3.5 + scale * step) + rounding * float(
+            torch.randn(1, generator=random)
+        )
 
     exact = scale * (1.0 / 3.5 - 1.0 / 3.5**2)
     numerical, uncertainty = central_difference(function)
@@ -127,7 +157,9 @@ def test_a_difference_is_as_good_as_rounding_allows_and_says_how_good(scale, rou
 
 
 def test_a_difference_passes_over_a_kink_within_long_steps_and_doubts_one_within_all_of_them():
-    assert central_difference(lambda step: abs(step + 0.1) + 0.3 * step)[0] == pytest.approx(1.3, rel=1e-12)
+    assert central_difference(lambda step: abs(step + 0.1) + 0.3 * step)[0] == pytest.approx(
+        1.3, rel=1e-12
+    )
     assert central_difference(lambda step: abs(step + 1e-3) + 0.3 * step)[1] > 1e-3
     assert central_difference(lambda step: math.nan)[1] == math.inf
 
@@ -141,7 +173,9 @@ def test_poissons_ratio_of_zero_has_a_derivative():
     def loss(given):
         return (weights * s.rollout(state, 2, parameters=given).q[-1]).sum()
 
-    check_slopes(loss, {"poissons_ratio": torch.zeros(1, dtype=torch.float64)}, {"poissons_ratio": 1e-3})
+    check_slopes(
+        loss, {"poissons_ratio": torch.zeros(1, dtype=torch.float64)}, {"poissons_ratio": 1e-3}
+    )
 
 
 @pytest.mark.parametrize("kind", ["hexahedron", "tetrahedron10"])
@@ -153,18 +187,33 @@ def test_static_equilibrium(kind):
     fixed = s.rest_positions[s.fixed] + 1e-3 * noise(b, d, 3, seed=2)
 
     ones = torch.ones(elements, dtype=torch.float64)
-    constants = {"youngs_modulus": 264e3 * ones, "poissons_ratio": 0.45 * ones[:1], "density": 1070.0 * ones}
+    constants = {
+        "youngs_modulus": 264e3 * ones,
+        "poissons_ratio": 0.45 * ones[:1],
+        "density": 1070.0 * ones,
+    }
 
     def loss(given):
         acting = Inputs(given["force"], given["fixed"])
-        return (weights * s.static_equilibrium(acting, {name: given[name] for name in constants}).q).sum()
+        return (
+            weights * s.static_equilibrium(acting, {name: given[name] for name in constants}).q
+        ).sum()
 
-    sizes = {"force": 1e-3, "fixed": 1e-5, "youngs_modulus": 2e3, "poissons_ratio": 1e-4, "density": 10.0}
+    sizes = {
+        "force": 1e-3,
+        "fixed": 1e-5,
+        "youngs_modulus": 2e3,
+        "poissons_ratio": 1e-4,
+        "density": 10.0,
+    }
     check_slopes(loss, {"force": force, "fixed": fixed, **constants}, sizes)
 
 
 def test_fixed_velocities_and_positions_of_fixed_vertices_have_no_hidden_influence():
-    """Forces on fixed vertices change nothing; where they stand at the start matters when nothing moves them."""
+    """Forces on fixed vertices change nothing.
+
+    Where they stand at the start matters when nothing moves them.
+    """
     s = simulator()
     state = pose(s, "bent", 1)
     q, force = state.q.clone().requires_grad_(True), torch.zeros_like(state.q).requires_grad_(True)

@@ -7,7 +7,16 @@ import pytest
 import torch
 
 from support.clamped import clamped
-from warp_resphys import Body, Corotated, PointMass, Simulator, State, box_hexahedra, box_tetrahedra, select_vertices
+from warp_resphys import (
+    Body,
+    Corotated,
+    PointMass,
+    Simulator,
+    State,
+    box_hexahedra,
+    box_tetrahedra,
+    select_vertices,
+)
 from warp_resphys.io.errors import InputError
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.integrators import INTEGRATORS
@@ -29,7 +38,9 @@ def swing(integrator, steps, material=SOFT, duration=0.04, moving=False):
     if moving:
         time = torch.linspace(0, duration, steps + 1, dtype=torch.float64)[1:]
         shift = 5e-3 * torch.sin(time / duration * np.pi / 2) ** 3
-        targets = state.q[:, simulator.fixed] + shift[:, None, None, None] * torch.tensor([0.0, 1.0, 0.0])
+        targets = state.q[:, simulator.fixed] + shift[:, None, None, None] * torch.tensor(
+            [0.0, 1.0, 0.0]
+        )
     trajectory = simulator.rollout(State(state.q, v), steps, Inputs(fixed_positions=targets))
     return trajectory.q[-1], trajectory.v[-1]
 
@@ -43,7 +54,9 @@ def swing(integrator, steps, material=SOFT, duration=0.04, moving=False):
     ],
 )
 def test_order_of_convergence(integrator, order, moving, prony):
-    """Large rotations and strains, dampings and branches: positions and velocities converge at the order."""
+    """Large rotations and strains, dampings and branches:
+    positions and velocities converge at the order.
+    """
     material = replace(SOFT, prony=prony)
     results = [swing(integrator, steps, material, moving=moving) for steps in (32, 64, 128)]
     free = torch.as_tensor(np.setdiff1d(np.arange(len(MESH.vertices)), CLAMPED.fixed_vertices))
@@ -75,7 +88,11 @@ def test_mass_damping_of_a_translation_is_exact(integrator, device):
     rest = simulator.rest_state()
     v = simulator.tensor([0.3, -0.2, 0.1]).expand_as(rest.v)
     final = simulator.rollout(State(rest.q, v), steps).final
-    factor = bdf2_decay(alpha * h, steps) if integrator == "bdf2" else GROWTH[integrator](alpha * h, steps)
+    factor = (
+        bdf2_decay(alpha * h, steps)
+        if integrator == "bdf2"
+        else GROWTH[integrator](alpha * h, steps)
+    )
     torch.testing.assert_close(final.v, factor * v, rtol=1e-8, atol=1e-9)
 
 
@@ -85,12 +102,20 @@ def test_free_fall(integrator):
     simulator = Simulator(Body(MESH), undamped, h, (0, 0, g), integrator, **TIGHT)
     final = simulator.rollout(simulator.rest_state(), steps).final
     t = h * steps
-    torch.testing.assert_close(final.v[..., 2], torch.full_like(final.v[..., 2], g * t), rtol=1e-8, atol=0.0)
+    torch.testing.assert_close(
+        final.v[..., 2], torch.full_like(final.v[..., 2], g * t), rtol=1e-8, atol=0.0
+    )
     fallen = (final.q - simulator.rest_positions)[0, :, 2]
     # Implicit Euler is ahead by g h t / 2; the starting step costs BDF2 a part of g h^2.
-    early = {"implicit_euler": g * t * h / 2, "midpoint": 0.0, "bdf2": float(fallen[0]) - g * t**2 / 2}[integrator]
+    early = {
+        "implicit_euler": g * t * h / 2,
+        "midpoint": 0.0,
+        "bdf2": float(fallen[0]) - g * t**2 / 2,
+    }[integrator]
     assert abs(early) <= abs(g * t * h / 2) + 1e-12
-    torch.testing.assert_close(fallen, torch.full_like(fallen, g * t**2 / 2 + early), rtol=1e-7, atol=0.0)
+    torch.testing.assert_close(
+        fallen, torch.full_like(fallen, g * t**2 / 2 + early), rtol=1e-7, atol=0.0
+    )
 
 
 def total_momenta(simulator, state):
@@ -127,13 +152,16 @@ def test_point_mass_weighs_and_slows():
     bare = Simulator(clamped(mesh), light, h, WEIGHTLESS, **TIGHT)
     force = torch.zeros_like(bare.rest_state().q)
     force[:, tip, 2] = -grams * g / len(tip)
-    pulled = -float((bare.static_equilibrium(Inputs(force)).q[0] - bare.rest_positions)[tip, 2].mean())
+    pulled = -float(
+        (bare.static_equilibrium(Inputs(force)).q[0] - bare.rest_positions)[tip, 2].mean()
+    )
     assert sag == pytest.approx(pulled, rel=1e-4)
     omega = np.sqrt(g / sag)  # k / m
     quarter = round(np.pi / omega / h)
     q = simulator.rollout(simulator.rest_state(), quarter).q[:, 0, tip, 2].mean(-1)
     drop = float(simulator.rest_positions[tip, 2].mean() - q[-1])
-    assert drop == pytest.approx(2 * sag, rel=0.02)  # half a period after the release: twice the sag
+    # Half a period after the release: twice the sag.
+    assert drop == pytest.approx(2 * sag, rel=0.02)
 
 
 def test_unknown_integrator_is_refused():

@@ -1,4 +1,7 @@
-"""Linearised steps and equilibria: the Hessian is the derivative of the residual; steps of Newton's method."""
+"""Linearised steps and equilibria: the Hessian is the derivative of the residual.
+
+Steps of Newton's method.
+"""
 
 from dataclasses import replace
 
@@ -9,7 +12,17 @@ import torch
 from support.chambered import chambered
 from support.clamped import clamped, noise
 from support.refusals import refuses
-from warp_resphys import Contact, Corotated, HalfSpace, InputError, Inputs, Mesh, Rigid, Simulator, Tendons
+from warp_resphys import (
+    Contact,
+    Corotated,
+    HalfSpace,
+    InputError,
+    Inputs,
+    Mesh,
+    Rigid,
+    Simulator,
+    Tendons,
+)
 from warp_resphys.dynamics.energy_set import EnergySet, place_energies
 from warp_resphys.dynamics.linearisation import Linearisation
 from warp_resphys.energies import Gent
@@ -26,7 +39,7 @@ TENDON = Tendons([Route(guides=GUIDES, offsets=[[0.0, 0.0, 1.0]])], 400.0)
 
 
 def linearised(rigid):
-    """A step of two bent bodies, positions at which to take it, and a direction of the coordinates."""
+    """A step of two bent bodies, positions at which to take it, and a direction of coordinates."""
     mesh = MESH if rigid else BOX
     body = clamped(mesh, energies=[TENDON], rigid={"cap": Rigid()} if rigid else {})
     s = Simulator(body, {"beam": Corotated(2e5)} if rigid else Corotated(2e5))
@@ -48,15 +61,19 @@ def test_product_matrix_and_solution_belong_to_the_derivative_of_the_residual(ri
     scale = float(difference.abs().max())
     step.update(x)
     on_controls = difference[:, step.free]
-    torch.testing.assert_close(step.product(direction)[:, step.free], on_controls, rtol=0.0, atol=1e-6 * scale)
+    torch.testing.assert_close(
+        step.product(direction)[:, step.free], on_controls, rtol=0.0, atol=1e-6 * scale
+    )
     matrix, inertia = step.matrix(x)
     flat = direction[0, step.free].flatten().numpy()
     np.testing.assert_allclose(matrix @ flat, on_controls[0].flatten(), atol=1e-6 * scale)
     mass = step.inertia_matrix(x)
     if not rigid:
         np.testing.assert_allclose(mass.diagonal(), inertia)
-    along, whole = np.tile([1.0, 0.0, 0.0], len(step.free)), np.tile([1.0, 2.0, 3.0], len(step.free))
-    assert whole @ mass @ whole == pytest.approx(14.0 * (along @ mass @ along))  # the same mass in every direction
+    along = np.tile([1.0, 0.0, 0.0], len(step.free))
+    whole = np.tile([1.0, 2.0, 3.0], len(step.free))
+    # The same mass in every direction.
+    assert whole @ mass @ whole == pytest.approx(14.0 * (along @ mass @ along))
     step.factorise(x)
     solved = step.solve(difference.flatten(1)[..., None])[..., 0].view_as(x)
     torch.testing.assert_close(solved, direction, rtol=1e-4, atol=1e-6)
@@ -80,14 +97,22 @@ def test_an_energy_set_names_parameters_by_region_and_knows_its_memory():
     assert energies.defaults["tip_youngs_modulus"] == 2e5
     assert {"root_density", "tip_density", "tendon_friction"} <= set(energies.parameters)
     given = {
-        name: energies.parameters[name].shaped(torch.as_tensor(v).double()) for name, v in energies.defaults.items()
+        name: energies.parameters[name].shaped(torch.as_tensor(v).double())
+        for name, v in energies.defaults.items()
     }
-    values, mass = energies.prepare({**given, "tip_density": torch.tensor([[500.0], [700.0]]).double()})
+    values, mass = energies.prepare(
+        {**given, "tip_density": torch.tensor([[500.0], [700.0]]).double()}
+    )
     volume = 0.02**3
-    np.testing.assert_allclose(mass.inertia.sum(1), [volume * (1000.0 + 2 * density) for density in (500.0, 700.0)])
+    np.testing.assert_allclose(
+        mass.inertia.sum(1), [volume * (1000.0 + 2 * density) for density in (500.0, 700.0)]
+    )
     assert "tendon_friction" in values[-1]
     energies.check_memory({"tendon_segment_tension": rest.new_zeros(2, 3)}, 2, rest)
-    for wrong in ({"tension": rest.new_zeros(2, 1)}, {"tendon_segment_tension": rest.new_zeros(2, 1)}):
+    for wrong in (
+        {"tension": rest.new_zeros(2, 1)},
+        {"tendon_segment_tension": rest.new_zeros(2, 1)},
+    ):
         refuses(InputError, next(iter(wrong)), energies.check_memory, wrong, 2, rest)
     twice = 2 * place_energies(body, materials)
     refuses(InputError, "two energies depend on", EnergySet, twice, *where)
@@ -99,11 +124,18 @@ FLOOR = HalfSpace(position=(0.0, 0.0, -0.015))
 
 
 def beam(material, *energies, **options):
-    return Simulator(clamped(BEAM, energies=energies), material, **({"relative_tolerance": 1e-12} | options))
+    return Simulator(
+        clamped(BEAM, energies=energies), material, **({"relative_tolerance": 1e-12} | options)
+    )
 
 
 CASES = {
-    "nearly incompressible": (lambda: beam(Corotated(2e5, 0.499)), Inputs(), "poissons_ratio", 0.499),
+    "nearly incompressible": (
+        lambda: beam(Corotated(2e5, 0.499)),
+        Inputs(),
+        "poissons_ratio",
+        0.499,
+    ),
     "law": (lambda: beam(Gent(9e3, 3.0, 1e6)), Inputs(), "limit", 3.0),
     "contact": (
         lambda: beam(Corotated(2e4, 0.45), Contact({"floor": FLOOR}, friction=0.3, distance=2e-3)),
@@ -141,7 +173,9 @@ def test_a_step_of_newtons_method_gives_the_derivative_of_an_equilibrium(case):
     here = simulator.linearise_equilibrium(inputs, {name: value})
     here.factorise(start)
     there = replace(simulator).linearise_equilibrium(inputs, {name: value * (1.0 + 1e-6)})
-    moved = here.solve((there.residual(start) - here.residual(start)).reshape(1, -1, 1)).view_as(start)
+    moved = here.solve((there.residual(start) - here.residual(start)).reshape(1, -1, 1)).view_as(
+        start
+    )
     derivative = -float((weights * moved).sum()) * 1e3
     assert derivative == pytest.approx(wanted, rel=1e-4, abs=10.0 * error + 1e-12)
 
@@ -149,7 +183,12 @@ def test_a_step_of_newtons_method_gives_the_derivative_of_an_equilibrium(case):
 def test_forces_that_follow_the_pose_are_refused():
     simulator = beam(Corotated(2e5, 0.45), Tendons([ROUTE], friction=0.3))
     assert simulator.energies.follow_pose
-    refuses(InputError, "solve its equilibria", simulator.linearise_equilibrium, Inputs(tendon_tension=3.0))
+    refuses(
+        InputError,
+        "solve its equilibria",
+        simulator.linearise_equilibrium,
+        Inputs(tendon_tension=3.0),
+    )
 
 
 def test_a_step_near_its_solution_takes_no_iterations_and_has_the_same_result():
@@ -162,6 +201,12 @@ def test_a_step_near_its_solution_takes_no_iterations_and_has_the_same_result():
     for integrator in ("bdf2", "midpoint"):
         other = replace(simulator, integrator=integrator)
         expected = other.step(state)
-        far = expected.q + 1e-3 * torch.rand(expected.q.shape, generator=torch.Generator().manual_seed(0)).double()
-        torch.testing.assert_close(replace(other).step(state, near=far).q, expected.q, rtol=0.0, atol=1e-8)
+        far = (
+            expected.q
+            + 1e-3
+            * torch.rand(expected.q.shape, generator=torch.Generator().manual_seed(0)).double()
+        )
+        torch.testing.assert_close(
+            replace(other).step(state, near=far).q, expected.q, rtol=0.0, atol=1e-8
+        )
     refuses(InputError, "near has shape", simulator.step, state, near=new.q[0])

@@ -1,4 +1,6 @@
-"""Relaxation branches of a material against closed forms, what they keep, their strain and gradients."""
+"""Relaxation branches of a material against closed forms,
+what they keep, their strain and gradients.
+"""
 
 from dataclasses import replace
 
@@ -8,7 +10,16 @@ import torch
 
 from support.clamped import clamped, noise
 from support.slopes import check_rows, check_slopes
-from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Simulator,
+    SolverSettings,
+    State,
+    box_hexahedra,
+    select_vertices,
+)
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.energies.viscosity import GreenStrain, StrainTerm
 from warp_resphys.io.errors import InputError
@@ -21,9 +32,12 @@ TIP = select_vertices(MESH, x=SIZE[0])
 CLAMPED = clamped(MESH)
 TIGHT = SolverSettings(name="newton", relative_tolerance=1e-11)
 WEIGHTLESS = (0.0, 0.0, 0.0)
-ELASTIC = Corotated(2e4, 0.0, density=1000.0)  # without lateral contraction: lambda is zero, all stiffness relaxes
+# Without lateral contraction: lambda is zero, all stiffness relaxes.
+ELASTIC = Corotated(2e4, 0.0, density=1000.0)
 CREEPING = replace(ELASTIC, prony=[(0.5, 0.2)])
-TWO_BRANCHES = Corotated(2e4, 0.45, density=1000.0, stiffness_damping=1e-3, prony=[(0.4, 0.02), (0.2, 0.3)])
+TWO_BRANCHES = Corotated(
+    2e4, 0.45, density=1000.0, stiffness_damping=1e-3, prony=[(0.4, 0.02), (0.2, 0.3)]
+)
 
 
 def pull(newtons, batch=1):
@@ -43,16 +57,23 @@ def test_a_roll_out_goes_on_from_its_last_state_and_a_batch_is_its_environments(
     half = simulator.rollout(simulator.rest_state(2), 4, Inputs(forces)).final
     assert half.memory["viscous_strain"].shape[:2] == (2, 2)
     again = State.from_tensors({name: tensor.clone() for name, tensor in half.tensors().items()})
-    torch.testing.assert_close(simulator.rollout(again, 4, Inputs(forces)).q[-1], whole.q[-1], rtol=0, atol=1e-11)
+    torch.testing.assert_close(
+        simulator.rollout(again, 4, Inputs(forces)).q[-1], whole.q[-1], rtol=0, atol=1e-11
+    )
     forgotten = replace(again, memory={})
-    assert float((simulator.rollout(forgotten, 4, Inputs(forces)).q[-1] - whole.q[-1]).abs().max()) > 1e-6
+    assert (
+        float((simulator.rollout(forgotten, 4, Inputs(forces)).q[-1] - whole.q[-1]).abs().max())
+        > 1e-6
+    )
     alone = simulator.rollout(simulator.rest_state(), 8, Inputs(forces[1:])).q[-1, 0]
     torch.testing.assert_close(alone, whole.q[-1, 1], rtol=0.0, atol=1e-11)
 
 
 @pytest.mark.parametrize(("start", "integrator"), [*zip(POSES, INTEGRATORS, strict=True)])
 def test_gradients_of_a_roll_out(start, integrator):
-    simulator = Simulator(CLAMPED, replace(TWO_BRANCHES, mass_damping=0.5), integrator=integrator, solver=TIGHT)
+    simulator = Simulator(
+        CLAMPED, replace(TWO_BRANCHES, mass_damping=0.5), integrator=integrator, solver=TIGHT
+    )
     check_rows(check_gradients(simulator, start), "prony_time_2, each environment")
 
 
@@ -90,19 +111,30 @@ def test_a_load_creeps_as_the_standard_linear_solid(integrator):
 def test_a_branch_much_shorter_than_a_step_is_kelvin_voigt_viscosity():
     ratio, time = 50.0, 1e-4
     state = pose(Simulator(CLAMPED, ELASTIC), "bent", 1)
-    maxwell, kelvin = replace(ELASTIC, prony=[(ratio, time)]), replace(ELASTIC, stiffness_damping=ratio * time)
-    positions = [Simulator(CLAMPED, m, solver=TIGHT).rollout(state, 5).q[-1] for m in (maxwell, kelvin, ELASTIC)]
+    maxwell = replace(ELASTIC, prony=[(ratio, time)])
+    kelvin = replace(ELASTIC, stiffness_damping=ratio * time)
+    positions = [
+        Simulator(CLAMPED, m, solver=TIGHT).rollout(state, 5).q[-1]
+        for m in (maxwell, kelvin, ELASTIC)
+    ]
     torch.testing.assert_close(positions[0], positions[1], rtol=0.0, atol=1e-9)
     assert float((positions[1] - positions[2]).abs().max()) > 1e-4
 
 
 def test_the_state_of_the_branches_turns_with_the_body():
     """A turned body under turned gravity moves as the other one does, whatever it still carries."""
-    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -1.0, 0.4], [1.0, 0.0, 0.2], [-0.4, -0.2, 0.0]]).double())
+    turn = torch.linalg.matrix_exp(
+        torch.tensor([[0.0, -1.0, 0.4], [1.0, 0.0, 0.2], [-0.4, -0.2, 0.0]]).double()
+    )
     gravity = torch.tensor([[0.0, 0.0, -9.8]], dtype=torch.float64)
-    simulator = Simulator(Body(MESH), TWO_BRANCHES, 0.005, integrator="bdf2", solver=TIGHT)  # free to turn
-    carried = simulator.rollout(pose(simulator, "bent", 1), 5, parameters={"gravity": gravity}).final
-    turned = State.from_tensors({k: x if k.startswith("memory.") else x @ turn.T for k, x in carried.tensors().items()})
+    # Free to turn.
+    simulator = Simulator(Body(MESH), TWO_BRANCHES, 0.005, integrator="bdf2", solver=TIGHT)
+    carried = simulator.rollout(
+        pose(simulator, "bent", 1), 5, parameters={"gravity": gravity}
+    ).final
+    turned = State.from_tensors(
+        {k: x if k.startswith("memory.") else x @ turn.T for k, x in carried.tensors().items()}
+    )
     first = simulator.rollout(carried, 5, parameters={"gravity": gravity})
     second = simulator.rollout(turned, 5, parameters={"gravity": gravity @ turn.T})
     torch.testing.assert_close(second.q[-1], first.q[-1] @ turn.T, rtol=0.0, atol=1e-10)
@@ -110,9 +142,15 @@ def test_the_state_of_the_branches_turns_with_the_body():
 
 def test_poses_know_nothing_of_branches_and_branches_that_do_nothing_cost_nothing():
     absent, idle = ELASTIC, replace(ELASTIC, prony=[(0.0, 0.1)])
-    poses = [Simulator(CLAMPED, m, solver=TIGHT).static_equilibrium(pull(0.2)).q for m in (CREEPING, absent)]
+    poses = [
+        Simulator(CLAMPED, m, solver=TIGHT).static_equilibrium(pull(0.2)).q
+        for m in (CREEPING, absent)
+    ]
     torch.testing.assert_close(*poses, rtol=0.0, atol=1e-12)
-    runs = [Simulator(CLAMPED, m).rollout(Simulator(CLAMPED, m).rest_state(), 3).final for m in (idle, absent)]
+    runs = [
+        Simulator(CLAMPED, m).rollout(Simulator(CLAMPED, m).rest_state(), 3).final
+        for m in (idle, absent)
+    ]
     assert torch.equal(runs[0].q, runs[1].q)
     assert not runs[0].memory
 
@@ -165,7 +203,14 @@ def strained(factor):
 
 def test_a_stretched_bar_has_its_strain_however_often_it_is_asked_for(term):
     one, two = stretched(1.1), stretched(1.2)
-    for q, factor in ((one, 1.1), (two, 1.2), (one, 1.1), (stretched(1.3), 1.3), (two, 1.2), (one, 1.1)):
+    for q, factor in (
+        (one, 1.1),
+        (two, 1.2),
+        (one, 1.1),
+        (stretched(1.3), 1.3),
+        (two, 1.2),
+        (one, 1.1),
+    ):
         strain = GreenStrain.apply(term, q)
         np.testing.assert_allclose(strain[..., 0, 0], strained(factor), rtol=1e-12)
         assert float(strain[..., 1:, :].abs().max()) < 1e-12

@@ -1,4 +1,6 @@
-"""Vibration modes: one basis, whatever rotation among vibrations of one frequency the eigensolver comes upon."""
+"""Vibration modes: one basis, whatever rotation among vibrations
+of one frequency the eigensolver comes upon.
+"""
 
 import numpy as np
 import pytest
@@ -30,10 +32,14 @@ def test_they_do_not_depend_on_the_basis_that_the_eigensolver_returns(held, coun
         clusters = np.split(shapes, np.flatnonzero(apart) + 1, axis=1)
         assert max(s.shape[1] for s in clusters) == (2 if held else 6)
         random = np.random.default_rng(0)
-        return values, np.hstack([s @ np.linalg.qr(random.standard_normal((s.shape[1],) * 2))[0] for s in clusters])
+        return values, np.hstack(
+            [s @ np.linalg.qr(random.standard_normal((s.shape[1],) * 2))[0] for s in clusters]
+        )
 
     monkeypatch.setattr(scipy.linalg, "eigh", turned)
-    torch.testing.assert_close(vibration_modes(simulator(held), count), expected, rtol=0.0, atol=1e-9)
+    torch.testing.assert_close(
+        vibration_modes(simulator(held), count), expected, rtol=0.0, atol=1e-9
+    )
 
 
 def test_a_square_beam_bends_along_its_axes_and_a_cut_pair_leaves_its_first():
@@ -41,4 +47,6 @@ def test_a_square_beam_bends_along_its_axes_and_a_cut_pair_leaves_its_first():
     across = modes[:, 1:].norm(dim=0)  # (y and z, mode)
     torch.testing.assert_close(across, torch.diag(across.diagonal()), rtol=0.0, atol=1e-9)
     assert bool((modes.sum(0)[[1, 2], [0, 1]] > 0.5).all())
-    torch.testing.assert_close(vibration_modes(simulator(), 1).view(-1, 3), modes[..., 0], rtol=0.0, atol=1e-12)
+    torch.testing.assert_close(
+        vibration_modes(simulator(), 1).view(-1, 3), modes[..., 0], rtol=0.0, atol=1e-12
+    )

@@ -7,7 +7,16 @@ import pytest
 import torch
 
 from support.clamped import clamped, noise
-from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Simulator,
+    SolverSettings,
+    State,
+    box_hexahedra,
+    select_vertices,
+)
 from warp_resphys.dynamics.minimiser import Minimiser
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
 from warp_resphys.energies.catalogue import MATERIALS
@@ -26,7 +35,9 @@ def simulator(name="quasi_newton", material=MATERIAL, device="cpu", **settings):
     return Simulator(BODY, material, solver=chosen, device=device)
 
 
-@pytest.mark.parametrize(("model", "start"), [("corotated", "twisted"), ("stable_neo_hookean", "bent")])
+@pytest.mark.parametrize(
+    ("model", "start"), [("corotated", "twisted"), ("stable_neo_hookean", "bent")]
+)
 def test_all_solvers_find_the_same_trajectory(model, start, device):
     material = MATERIALS[model](**MATERIAL.values)
     results = {}
@@ -40,16 +51,30 @@ def test_all_solvers_find_the_same_trajectory(model, start, device):
         torch.testing.assert_close(results[name], results[SOLVERS[0]], rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize(("name", "poissons_ratio"), [*zip(SOLVERS, (0.499, 0.499, 0.45), strict=True)])
+@pytest.mark.parametrize(
+    ("name", "poissons_ratio"), [*zip(SOLVERS, (0.499, 0.499, 0.45), strict=True)]
+)
 def test_factors_in_single_precision_lead_to_the_same_residual(name, poissons_ratio, device):
-    """And take hardly more iterations: 1e-8 is a hundredth of what float32 resolves of these forces."""
+    """And take hardly more iterations: 1e-8 is a hundredth
+    of what float32 resolves of these forces.
+    """
     material = replace(MATERIAL, poissons_ratio=poissons_ratio)
     results = {}
     for factors in ("double", "single"):
-        s = simulator(name, material, device=device, relative_tolerance=1e-8, factors=factors, max_iterations=5000)
+        s = simulator(
+            name,
+            material,
+            device=device,
+            relative_tolerance=1e-8,
+            factors=factors,
+            max_iterations=5000,
+        )
         trajectory = s.rollout(pose(s, "bent", 2), 4)
         assert all(float(report.relative_residual.max()) <= 1e-8 for report in trajectory.reports)
-        results[factors] = trajectory.q, sum(int(report.iterations.sum()) for report in trajectory.reports)
+        results[factors] = (
+            trajectory.q,
+            sum(int(report.iterations.sum()) for report in trajectory.reports),
+        )
     torch.testing.assert_close(results["single"][0], results["double"][0], rtol=0.0, atol=1e-8)
     assert results["single"][0].dtype == torch.float64
     assert results["single"][1] <= 1.25 * results["double"][1]
@@ -64,7 +89,9 @@ def test_solver_finds_the_minimum_and_reports_it():
     energy, balance = potential.evaluate()
     residual = float(torch.linalg.vector_norm(potential.residual))
     scale = float(balance) + float(torch.linalg.vector_norm(potential.terms.force))
-    assert residual / scale == pytest.approx(float(new.report.relative_residual), rel=1e-6, abs=1e-13)
+    assert residual / scale == pytest.approx(
+        float(new.report.relative_residual), rel=1e-6, abs=1e-13
+    )
     assert 2 <= int(new.report.iterations) <= 30
     potential.positions.copy_(new.q + 1e-5 * noise(*new.q.shape) * potential.free_mask[:, None])
     assert float(potential.evaluate()[0]) > float(energy)
@@ -76,7 +103,9 @@ def test_failure_carries_the_last_positions_and_the_report(name):
     easy = s.rest_state(1)
     hard = pose(s, "twisted", 1)
     state = State(torch.cat([easy.q, hard.q]), torch.cat([easy.v, hard.v]))
-    with pytest.raises(ConvergenceError, match=f"the {name} solver stopped after 1 iterations") as caught:
+    with pytest.raises(
+        ConvergenceError, match=f"the {name} solver stopped after 1 iterations"
+    ) as caught:
         s.step(state)
     error = caught.value
     assert error.positions.shape == (2, BODY.n_vertices, 3)
@@ -88,7 +117,9 @@ def test_failure_carries_the_last_positions_and_the_report(name):
 
 @pytest.fixture
 def pulled_beam():
-    """Simulators of the README's beam by settings, nearly incompressible, and its pose under a pull."""
+    """Simulators of the README's beam by settings, nearly incompressible,
+    and its pose under a pull.
+    """
     mesh = box_hexahedra((0.1, 0.03, 0.03), (10, 3, 3))
     body = clamped(mesh)
 
@@ -103,7 +134,9 @@ def pulled_beam():
 
 @pytest.mark.parametrize(("name", "tolerance"), [("quasi_newton", 1e-5), ("newton", 1e-8)])
 def test_float32_converges_for_a_nearly_incompressible_solid(pulled_beam, name, tolerance, device):
-    """To the resolution of its positions, about 4e-9 m: the volume term leaves float32 no digit of the residual."""
+    """To the resolution of its positions, about 4e-9 m:
+    the volume term leaves float32 no digit of the residual.
+    """
     make, held = pulled_beam
     reference = make(device=device).rollout(State(held.q.to(device), held.v.to(device)), 20)
     single = make(solver=name, relative_tolerance=tolerance, dtype=torch.float32, device=device)
@@ -121,7 +154,9 @@ def test_float32_gradients_of_a_nearly_incompressible_solid(pulled_beam):
         modulus = torch.tensor([264e3], dtype=dtype, requires_grad=True)
         q = held.q.to(dtype).requires_grad_()
         sim = make(dtype=dtype, relative_tolerance=1e-8)
-        end = sim.rollout(State(q, torch.zeros_like(q)), 5, parameters={"youngs_modulus": modulus}).q[-1]
+        end = sim.rollout(
+            State(q, torch.zeros_like(q)), 5, parameters={"youngs_modulus": modulus}
+        ).q[-1]
         gradients.append(torch.autograd.grad(end[..., 2].square().sum(), (q, modulus)))
     for exact, single in zip(*gradients, strict=True):
         assert single.dtype == torch.float32
@@ -129,7 +164,10 @@ def test_float32_gradients_of_a_nearly_incompressible_solid(pulled_beam):
 
 
 def test_a_slow_solver_is_not_taken_for_one_at_rounding(pulled_beam):
-    """A kilometre from the origin rounding leaves residuals of 3e-7; projective dynamics crawls long before that."""
+    """A kilometre from the origin rounding leaves residuals of 3e-7.
+
+    Projective dynamics crawls long before that.
+    """
     make, held = pulled_beam
     start = State(held.q + 1000.0, held.v)
     exact = make(0.495, solver="newton").step(start)
@@ -149,7 +187,9 @@ def test_a_slow_solver_is_not_taken_for_one_at_rounding(pulled_beam):
     ],
 )
 def test_an_overflow_touches_neither_neighbours_nor_later_steps(name, linear_solver, speed, device):
-    s = simulator(name, device=device, linear_solver=linear_solver, on_failure="count", max_iterations=500)
+    s = simulator(
+        name, device=device, linear_solver=linear_solver, on_failure="count", max_iterations=500
+    )
     calm = pose(s, "bent", 2)
     expected = [s.step(calm)]
     expected.append(s.step(expected[0]))
@@ -163,17 +203,29 @@ def test_an_overflow_touches_neither_neighbours_nor_later_steps(name, linear_sol
     for step in range(2):
         state = s.step(state)
         assert bool(state.converged.all())
-        assert int(state.report.iterations.max()) <= 2 * max(int(own.report.iterations.max()) for own in expected)
+        assert int(state.report.iterations.max()) <= 2 * max(
+            int(own.report.iterations.max()) for own in expected
+        )
         torch.testing.assert_close(state.q[0], expected[step].q[0], rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
     ("name", "dtype", "offset"),
-    [("quasi_newton", torch.float32, 1.0), ("newton", torch.float64, 1.0), ("projective_dynamics", torch.float32, 0.0)],
+    [
+        ("quasi_newton", torch.float32, 1.0),
+        ("newton", torch.float64, 1.0),
+        ("projective_dynamics", torch.float32, 0.0),
+    ],
 )
 def test_a_body_on_which_nothing_acts_converges_at_once(name, dtype, offset):
     """Its residual is rounding, and so are the forces that it would be measured against."""
-    s = Simulator(BODY, Corotated(264e3, 0.499, density=1070.0), gravity=(0.0, 0.0, 0.0), solver=name, dtype=dtype)
+    s = Simulator(
+        BODY,
+        Corotated(264e3, 0.499, density=1070.0),
+        gravity=(0.0, 0.0, 0.0),
+        solver=name,
+        dtype=dtype,
+    )
     rest = s.rest_state(2)
     trajectory = s.rollout(State(rest.q + offset, rest.v), 3)
     assert max(int(report.iterations.max()) for report in trajectory.reports) <= 10
@@ -224,7 +276,9 @@ class DiagonalMetric:
 
 
 def bfgs_inverse(inverse, pairs):
-    """Nocedal and Wright (2006), equation 6.17, one pair after another, where the curvature is positive."""
+    """Nocedal and Wright (2006), equation 6.17, one pair after another,
+    where the curvature is positive.
+    """
     h, unit = torch.diag(inverse), torch.eye(len(inverse), dtype=torch.float64)
     for s, y in pairs:
         left = unit - torch.outer(s, y) / (s @ y)
@@ -233,22 +287,32 @@ def bfgs_inverse(inverse, pairs):
 
 
 def test_directions_equal_the_bfgs_formula():
-    """More pairs than memory, two environments with line searches of their own, vertices in another order."""
+    """More pairs than memory, two environments with line searches of their own,
+    vertices in another order.
+    """
     s, memory = simulator(), 3
     potential, free = s.workspace(2).potential, BODY.n_vertices - len(BODY.fixed_vertices)
     s.step(pose(s, "bent", 2))  # sets the terms of a step
     generator = torch.Generator().manual_seed(0)
     vertex_at = np.setdiff1d(np.arange(BODY.n_vertices), BODY.fixed_vertices)[::-1].copy()
     inverse = 2e-3 * (1.0 + torch.rand(2, free, 3, generator=generator, dtype=torch.float64))
-    metric, limits = DiagonalMetric(inverse, vertex_at), {"relative": 1e-12, "absolute": 1e-12, "epsilon": 2e-16}
-    limits = struct_of(kernels.Tolerances, **limits, max_iterations=1000, refactor_after=kernels.NEVER)
+    metric = DiagonalMetric(inverse, vertex_at)
+    limits = {"relative": 1e-12, "absolute": 1e-12, "epsilon": 2e-16}
+    limits = struct_of(
+        kernels.Tolerances, **limits, max_iterations=1000, refactor_after=kernels.NEVER
+    )
     minimiser = Minimiser(potential, metric, torch.float64, memory, limits)
-    start = s.rest_positions + 1e-3 * torch.randn(2, BODY.n_vertices, 3, generator=generator, dtype=torch.float64)
+    start = s.rest_positions + 1e-3 * torch.randn(
+        2, BODY.n_vertices, 3, generator=generator, dtype=torch.float64
+    )
     start[:, s.fixed] = s.rest_positions[s.fixed]
     state = minimiser.begin(start)
 
     def now(b):
-        return (field[b, vertex_at].flatten().clone() for field in (potential.positions, potential.residual))
+        return (
+            field[b, vertex_at].flatten().clone()
+            for field in (potential.positions, potential.residual)
+        )
 
     pairs = ([], [])
     here = [tuple(now(b)) for b in range(2)]
@@ -265,7 +329,9 @@ def test_directions_equal_the_bfgs_formula():
             expected = -bfgs_inverse(inverse[b].flatten(), pairs[b][-memory:]) @ here[b][1]
             moved = x - here[b][0]
             share = float(moved @ expected / (expected @ expected))
-            torch.testing.assert_close(moved, share * expected, rtol=0.0, atol=1e-9 * float(moved.abs().max()))
+            torch.testing.assert_close(
+                moved, share * expected, rtol=0.0, atol=1e-9 * float(moved.abs().max())
+            )
             assert share > 0.0
             pairs[b].append((moved, g - here[b][1]))
             here[b] = (x, g)
@@ -286,11 +352,17 @@ def iterations(reports):
 
 @pytest.mark.parametrize(("name", "degree"), [*zip(SOLVERS, (0, 1, 2), strict=True)])
 def test_polynomial_forces_are_extrapolated(name, degree, device):
-    """A free body under its weight and a multiple of it: how far a step is off inertia goes with the force."""
+    """A free body under its weight and a multiple of it:
+    how far a step is off inertia goes with the force.
+    """
     s = stepping(Body(MESH), device=device, solver={"name": name})
-    weight = s.prepare().mass[0, :, None] * torch.tensor([0.0, 0.0, 9.8], dtype=torch.float64, device=device)
+    weight = s.prepare().mass[0, :, None] * torch.tensor(
+        [0.0, 0.0, 9.8], dtype=torch.float64, device=device
+    )
     growth = torch.arange(7, dtype=torch.float64, device=device) ** degree
-    forces = (growth[:, None, None, None] * torch.tensor([[[1.0]], [[-2.0]]], device=device).double()) * weight
+    forces = (
+        growth[:, None, None, None] * torch.tensor([[[1.0]], [[-2.0]]], device=device).double()
+    ) * weight
     counts = iterations(s.rollout(s.rest_state(2), 7, Inputs(forces)).reports)
     assert min(counts[0]) > 0
     assert counts[degree + 2 :] == [[0, 0]] * (5 - degree)
@@ -306,14 +378,18 @@ def test_it_saves_iterations_and_changes_no_state(integrator, time_step, device)
     for k in range(steps):  # In turns, so that neither goes on where its own last step has led.
         state = pair[k % 2].step(state)
         alone.append(state.report)
-    sums = [sum(sum(counts) for counts in iterations(reports)) for reports in (followed.reports, alone)]
+    sums = [
+        sum(sum(counts) for counts in iterations(reports)) for reports in (followed.reports, alone)
+    ]
     assert sums[0] < (1.02 if time_step == 0.01 else 0.9) * sums[1]
     torch.testing.assert_close(followed.q[-1], state.q, rtol=0.0, atol=2e-9)
 
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_another_motion_begins_anew(name, device):
-    """A roll-out finds, bit for bit, what that of a new simulator finds: neither guesses nor factors are left over."""
+    """A roll-out finds, bit for bit, what that of a new simulator finds:
+    neither guesses nor factors are left over.
+    """
     s, fresh = (stepping(device=device, solver={"name": name}) for _ in range(2))
     s.rollout(pose(s, "bent", 2), 5)
     other = s.rest_state(2)

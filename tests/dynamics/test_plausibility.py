@@ -1,4 +1,6 @@
-"""Warnings of sizes, units and cells that look like a mistake, and of cells by what quadratic ones would change."""
+"""Warnings of sizes, units and cells that look like a mistake,
+and of cells by what quadratic ones would change.
+"""
 
 import re
 import warnings
@@ -9,7 +11,18 @@ import pytest
 import torch
 
 from support.clamped import clamped
-from warp_resphys import Body, Contact, HalfSpace, Inputs, Mesh, ResphysWarning, Rigid, Scene, Simulator, quadratic
+from warp_resphys import (
+    Body,
+    Contact,
+    HalfSpace,
+    Inputs,
+    Mesh,
+    ResphysWarning,
+    Rigid,
+    Scene,
+    Simulator,
+    quadratic,
+)
 from warp_resphys.dynamics.plausibility import small_strain_stiffness
 from warp_resphys.energies.convex_material import ConvexMaterial
 from warp_resphys.energies.materials import Corotated, StableNeoHookean
@@ -19,7 +32,9 @@ from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
 def beam(scale=1.0, mesh=None):
     """A beam of 0.1 m, times a factor."""
     mesh = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2)) if mesh is None else mesh
-    return Body(Mesh(scale * mesh.vertices, mesh.cells), fixed=np.flatnonzero(mesh.vertices[:, 0] == 0.0))
+    return Body(
+        Mesh(scale * mesh.vertices, mesh.cells), fixed=np.flatnonzero(mesh.vertices[:, 0] == 0.0)
+    )
 
 
 @pytest.mark.parametrize(
@@ -28,13 +43,23 @@ def beam(scale=1.0, mesh=None):
         (beam(1e3), {}, r"the body is 10\d\.\d+ m across: .*mesh\.units"),
         (beam(1e-3), {}, r"the body is 0\.00010\d+ m across: .*units"),
         (beam(), {"material": Corotated(0.2)}, r"Young's modulus is 0\.2 Pa, softer than a gel"),
-        (beam(), {"material": StableNeoHookean(2e8)}, r"Young's modulus is 2e\+08 Pa, stiffer than any rubber"),
-        (beam(), {"material": Corotated(density=1.0)}, r"density is 1 kg/m\^3, lighter than a foam"),
+        (
+            beam(),
+            {"material": StableNeoHookean(2e8)},
+            r"Young's modulus is 2e\+08 Pa, stiffer than any rubber",
+        ),
+        (
+            beam(),
+            {"material": Corotated(density=1.0)},
+            r"density is 1 kg/m\^3, lighter than a foam",
+        ),
         (beam(), {"gravity": (0.0, 0.0, -9810.0)}, r"gravity is 9810 m/s\^2: .*mm/s\^2"),
     ],
 )
 def test_a_wrong_unit_is_one_warning(body, changes, words):
-    """A warning names the value and the unit that is expected, at the line that makes the simulator."""
+    """A warning names the value and the unit that is expected,
+    at the line that makes the simulator.
+    """
     with pytest.warns(ResphysWarning, match=words) as caught:
         Simulator(body, **changes)
     assert len(caught) == 1
@@ -52,7 +77,9 @@ def test_a_nearly_flat_cell_is_named_with_its_place():
     normal /= np.linalg.norm(normal)
     vertices = mesh.vertices.copy()
     vertices[inner] += 0.995 * (towards @ normal) * normal
-    with pytest.warns(ResphysWarning, match=r"cell \d+ of the body around \(.*\) mm is nearly flat") as caught:
+    with pytest.warns(
+        ResphysWarning, match=r"cell \d+ of the body around \(.*\) mm is nearly flat"
+    ) as caught:
         Simulator(beam(mesh=Mesh(vertices, mesh.cells)))
     number = int(str(caught[0].message).split()[1])
     assert inner in mesh.cells[number]
@@ -75,7 +102,9 @@ def test_the_warnings_are_silenced_by_their_class():
     + [(quadratic(box_hexahedra((0.04, 0.03, 0.02), (1, 1, 1))), 1.0)],
 )
 def test_a_free_body_of_few_cells_turns_too_slowly(mesh, ratio):
-    """Its moment of inertia is m (a^2 + b^2) / 12, and more where its mass lies on the corners of linear cells."""
+    """Its moment of inertia is m (a^2 + b^2) / 12, and more
+    where its mass lies on the corners of linear cells.
+    """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         Simulator(Body(mesh))
@@ -85,7 +114,9 @@ def test_a_free_body_of_few_cells_turns_too_slowly(mesh, ratio):
         assert not caught
         return
     (warning,) = caught
-    assert f"the body, which nothing holds, has {ratio:.3g} times its true rotary inertia" in str(warning.message)
+    assert f"the body, which nothing holds, has {ratio:.3g} times its true rotary inertia" in str(
+        warning.message
+    )
 
 
 @pytest.mark.parametrize("divisions", [1, 2, 3])
@@ -106,7 +137,9 @@ def test_a_rigid_body_has_the_rotary_inertia_of_its_shape(divisions):
 
 
 def test_stiffness_at_small_strains():
-    """Three times the shear modulus, where a law has no Young's modulus: G = 2 (c10 + c01) + Ogden's moduli."""
+    """Three times the shear modulus, where a law has no Young's modulus:
+    G = 2 (c10 + c01) + Ogden's moduli.
+    """
     law = ConvexMaterial(c10=20e3, c01=5e3, ogden={4: 30e3})
     assert small_strain_stiffness(law) == pytest.approx(3.0 * (2.0 * 25e3 + 30e3))
     assert small_strain_stiffness(replace(Corotated(), youngs_modulus=3e5)) == 3e5
@@ -123,7 +156,9 @@ def sag(mesh, material, **options):
         warnings.simplefilter("always")
         q = simulator.static_equilibrium().q[0].numpy()
     mass = simulator.prepare().load_mass[0].numpy()
-    return float(mass @ (mesh.vertices - q)[:, 2] / mass.sum()), [str(warning.message) for warning in caught]
+    return float(mass @ (mesh.vertices - q)[:, 2] / mass.sum()), [
+        str(warning.message) for warning in caught
+    ]
 
 
 def estimated(words):
@@ -139,7 +174,9 @@ def layered(divisions, thickness=1e-3):
     vertices = box.vertices.copy()
     vertices[:, 2] = np.interp(box.vertices[:, 2], np.linspace(0.0, 1.0, len(heights)), heights)
     layer = vertices[box.cells].mean(1)[:, 2] < thickness
-    return Mesh(vertices, box.cells, {"layer": np.flatnonzero(layer), "soft": np.flatnonzero(~layer)})
+    return Mesh(
+        vertices, box.cells, {"layer": np.flatnonzero(layer), "soft": np.flatnonzero(~layer)}
+    )
 
 
 LAYERS = {"layer": Corotated(1e7, 0.3), "soft": Corotated(1e5, 0.45)}
@@ -193,14 +230,21 @@ def test_good_meshes_are_not_warned_of(mesh, material):
 
 def test_a_body_of_a_scene_is_named_and_warned_of_once():
     """In the first of its equilibria that shows it, here under a force."""
-    scene = Scene({n: clamped(box_hexahedra(SIZE, d)) for n, d in (("coarse", (4, 2, 2)), ("fine", (12, 4, 4)))})
+    scene = Scene(
+        {
+            n: clamped(box_hexahedra(SIZE, d))
+            for n, d in (("coarse", (4, 2, 2)), ("fine", (12, 4, 4)))
+        }
+    )
     simulator = Simulator(scene, Corotated(264e3, 0.45), gravity=(0.0, 0.0, 0.0))
     force = np.zeros((1, scene.n_vertices, 3))
     force[:, np.isclose(scene.vertices[:, 0], 0.1), 2] = 1e-3
     with warnings.catch_warnings():
         warnings.simplefilter("error", ResphysWarning)
         simulator.static_equilibrium()
-    with pytest.warns(ResphysWarning, match="linear hexahedra of the body 'coarse' are too coarse") as caught:
+    with pytest.warns(
+        ResphysWarning, match="linear hexahedra of the body 'coarse' are too coarse"
+    ) as caught:
         simulator.static_equilibrium(Inputs(force))
     assert len(caught) == 1
     with warnings.catch_warnings():

@@ -1,4 +1,6 @@
-"""Safeguards: masks for indices, failures for results, and derivatives that there are not must not pass in silence."""
+"""Safeguards: masks for indices, failures for results,
+and derivatives that there are not must not pass in silence.
+"""
 
 import dataclasses
 import re
@@ -10,7 +12,17 @@ from torch.autograd import forward_ad
 
 from support.clamped import clamped
 from support.refusals import refuses
-from warp_resphys import Contact, Corotated, HalfSpace, Inputs, Simulator, SolverSettings, State, Tendons, box_hexahedra
+from warp_resphys import (
+    Contact,
+    Corotated,
+    HalfSpace,
+    Inputs,
+    Simulator,
+    SolverSettings,
+    State,
+    Tendons,
+    box_hexahedra,
+)
 from warp_resphys.dynamics import statics
 from warp_resphys.energies.contact.barrier import barrier_pressure
 from warp_resphys.fem.bodies import Body
@@ -23,14 +35,21 @@ RUBBER = Corotated(264e3, 0.45)
 
 
 def test_a_static_equilibrium_that_takes_long_shows_its_iterations(monkeypatch, capsys):
-    """Iterations and residual, in the error output; the callback of the potential is that of before afterwards."""
+    """Iterations and residual, in the error output.
+
+    The callback of the potential is that of before afterwards.
+    """
     simulator = Simulator(CLAMPED, RUBBER)
     simulator.static_equilibrium()
     assert capsys.readouterr() == ("", "")
     monkeypatch.setattr(statics, "QUIET_SECONDS", 1e-9)
     simulator.static_equilibrium(batch=2)
     shown = capsys.readouterr().err
-    assert re.search(r"^static equilibrium: iteration \d+ \(limit 100\), in \d s, residual \S+e-\d+$", shown, re.M)
+    assert re.search(
+        r"^static equilibrium: iteration \d+ \(limit 100\), in \d s, residual \S+e-\d+$",
+        shown,
+        re.M,
+    )
     assert simulator.workspace(2).parts[0][1].potential.on_direction() is None
 
 
@@ -55,7 +74,9 @@ def test_an_equilibrium_that_is_far_is_reached_under_growing_loads():
     results = []
     for most in (2000, 8):
         modulus = torch.full((1, 1), 5e4, dtype=torch.float64, requires_grad=True)
-        simulator = Simulator(body, Corotated(5e4, 0.45), solver=SolverSettings(max_iterations=most))
+        simulator = Simulator(
+            body, Corotated(5e4, 0.45), solver=SolverSettings(max_iterations=most)
+        )
         q = simulator.static_equilibrium(parameters={"youngs_modulus": modulus}).q
         q[..., 2].mean().backward()
         results.append((q.detach(), modulus.grad))
@@ -66,7 +87,9 @@ def test_an_equilibrium_that_is_far_is_reached_under_growing_loads():
 @pytest.mark.parametrize("linear_solver", ["banded", "sparse"])
 def test_a_singular_system_is_a_convergence_error_with_every_linear_solver(linear_solver):
     hinged = Body(MESH, fixed=[0])
-    sim = Simulator(hinged, RUBBER, solver=SolverSettings(linear_solver=linear_solver, max_iterations=20))
+    sim = Simulator(
+        hinged, RUBBER, solver=SolverSettings(linear_solver=linear_solver, max_iterations=20)
+    )
     with pytest.raises(ConvergenceError):
         sim.static_equilibrium()
 
@@ -81,7 +104,13 @@ def test_a_simulator_is_constant_and_states_of_another_type_are_refused():
     refuses(InputError, r"state\.q", sim.step, State(state.q.float(), state.v))
     refuses(InputError, r"state\.q", sim.step, State(state.q.numpy(), state.v))
     refuses(InputError, "steps is -3", sim.rollout, state, -3)
-    refuses(InputError, "the inputs are a Tensor: give Inputs", sim.step, state, torch.zeros_like(state.q))
+    refuses(
+        InputError,
+        "the inputs are a Tensor: give Inputs",
+        sim.step,
+        state,
+        torch.zeros_like(state.q),
+    )
 
 
 def test_a_matrix_beyond_32_bit_addresses_is_refused():
@@ -97,11 +126,17 @@ TENDON = Tendons([np.linspace([0.0, 0.01, 0.02], [0.1, 0.01, 0.02], 5)], frictio
 
 
 def simulator(*energies):
-    return Simulator(clamped(BEAM, energies=energies), Corotated(100e3, 0.4, stiffness_damping=1e-3))
+    return Simulator(
+        clamped(BEAM, energies=energies), Corotated(100e3, 0.4, stiffness_damping=1e-3)
+    )
 
 
 def of_modulus(sim, scale):
-    return sim.rollout(sim.rest_state(), 3, parameters={"youngs_modulus": 1e5 * scale}).q[-1, ..., 2].mean()
+    return (
+        sim.rollout(sim.rest_state(), 3, parameters={"youngs_modulus": 1e5 * scale})
+        .q[-1, ..., 2]
+        .mean()
+    )
 
 
 def of_equilibrium(sim, scale):
@@ -126,13 +161,20 @@ CASES = [
     ((), lambda sim, scale: 0.0 * of_modulus(sim, scale)),
     ((FLOOR,), of_modulus),
     ((FLOOR,), of_state),
-    ((TENDON,), lambda sim, scale: sim.step(sim.rest_state(), Inputs(tendon_tension=0.3 * scale[None])).q.sum()),
+    (
+        (TENDON,),
+        lambda sim, scale: sim.step(
+            sim.rest_state(), Inputs(tendon_tension=0.3 * scale[None])
+        ).q.sum(),
+    ),
 ]
 
 
 @pytest.mark.parametrize(("energies", "function"), CASES)
 def test_second_derivatives_are_refused(energies, function):
-    """Losses that are linear in the solution are refused, too: their gradient does not depend on an incoming one."""
+    """Losses that are linear in the solution are refused, too:
+    their gradient does not depend on an incoming one.
+    """
     sim = simulator(*energies)
     loss = lambda scale: function(sim, scale)  # noqa: E731
     scale = ONE.clone().requires_grad_()
@@ -140,11 +182,19 @@ def test_second_derivatives_are_refused(energies, function):
     for leaves in ({"inputs": scale}, {}):
         (slope,) = torch.autograd.grad(loss(scale), scale, create_graph=True)
         torch.testing.assert_close(slope, expected, rtol=1e-9, atol=0.0)
-        with pytest.raises(DerivativeError, match="second derivatives of a simulation are not available"):
+        with pytest.raises(
+            DerivativeError, match="second derivatives of a simulation are not available"
+        ):
             torch.autograd.backward(slope, **leaves)
-    for second in (torch.autograd.functional.hessian, torch.autograd.functional.hvp, torch.autograd.functional.jvp):
+    for second in (
+        torch.autograd.functional.hessian,
+        torch.autograd.functional.hvp,
+        torch.autograd.functional.jvp,
+    ):
         with pytest.raises(DerivativeError):
-            second(loss, ONE) if second is torch.autograd.functional.hessian else second(loss, ONE, ONE)
+            second(loss, ONE) if second is torch.autograd.functional.hessian else second(
+                loss, ONE, ONE
+            )
 
 
 @pytest.mark.parametrize("transform", ["hessian", "jacrev", "jacfwd", "grad", "vmap"])
@@ -157,13 +207,20 @@ def test_transforms_are_refused(transform, function):
 
 def test_batched_gradients_forward_mode_and_two_derivatives_of_the_barrier_are_refused():
     sim = simulator()
-    heights = lambda scale: sim.rollout(sim.rest_state(), 2, parameters={"youngs_modulus": 1e5 * scale}).q[-1, 0, -3:]  # noqa: E731
+
+    def heights(scale):
+        parameters = {"youngs_modulus": 1e5 * scale}
+        return sim.rollout(sim.rest_state(), 2, parameters=parameters).q[-1, 0, -3:]
+
     alone = torch.autograd.functional.jacobian(heights, ONE)
     assert bool((alone != 0.0).any())
     with pytest.raises(DerivativeError, match="vectorize"):
         torch.autograd.functional.jacobian(heights, ONE, vectorize=True)
     for function in (of_modulus, of_state):
-        with forward_ad.dual_level(), pytest.raises(DerivativeError, match="forward-mode derivatives"):
+        with (
+            forward_ad.dual_level(),
+            pytest.raises(DerivativeError, match="forward-mode derivatives"),
+        ):
             function(sim, forward_ad.make_dual(ONE, ONE))
     d = torch.tensor([0.3], dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(barrier_pressure(d, 1.0).sum(), d, create_graph=True)

@@ -1,4 +1,6 @@
-"""A batch is what its environments are one by one, whatever threads share it, and solves on a device those of a CPU."""
+"""A batch is what its environments are one by one, whatever threads share it,
+and solves on a device those of a CPU.
+"""
 
 import time
 from threading import get_ident
@@ -7,7 +9,15 @@ import pytest
 import torch
 
 from support.clamped import clamped
-from warp_resphys import Inputs, Simulator, SolverSettings, State, box_hexahedra, box_tetrahedra, select_vertices
+from warp_resphys import (
+    Inputs,
+    Simulator,
+    SolverSettings,
+    State,
+    box_hexahedra,
+    box_tetrahedra,
+    select_vertices,
+)
 from warp_resphys.dynamics.assembly import HessianAssembly
 from warp_resphys.dynamics.minimiser import Minimiser
 from warp_resphys.energies.launcher import Launcher
@@ -28,18 +38,26 @@ def threads(monkeypatch, count):
 
 def simulator(**settings):
     material = Corotated(1e5, 0.45, density=1000.0, stiffness_damping=1e-3)
-    return Simulator(BODY, material, solver=SolverSettings(**({"relative_tolerance": 1e-5} | settings)))
+    return Simulator(
+        BODY, material, solver=SolverSettings(**({"relative_tolerance": 1e-5} | settings))
+    )
 
 
 @pytest.fixture
 def motion():
-    """A start, forces and a modulus that differ from one environment to the next, none as hard as the other."""
+    """A start, forces and a modulus that differ from one environment to the next,
+    none as hard as the other.
+    """
     sim = simulator()
     generator = torch.Generator().manual_seed(0)
     start = pose(sim, "bent", SIZE)
     growth, rest = torch.linspace(0.0, 1.2, SIZE)[:, None, None], sim.rest_positions
     start = State(rest + growth * (start.q - rest), start.v)
-    forces = 2.5e-3 * growth * torch.randn(STEPS, *start.q.shape, generator=generator, dtype=torch.float64)
+    forces = (
+        2.5e-3
+        * growth
+        * torch.randn(STEPS, *start.q.shape, generator=generator, dtype=torch.float64)
+    )
     modulus = 1e5 * (1.0 + torch.rand(SIZE, 1, generator=generator, dtype=torch.float64))
     return start, forces, modulus
 
@@ -47,11 +65,14 @@ def motion():
 def rolled(motion, rows, **settings):
     start, forces, modulus = motion
     state = State(start.q[rows], start.v[rows])
-    return simulator(**settings).rollout(state, STEPS, Inputs(forces[:, rows]), {"youngs_modulus": modulus[rows]})
+    return simulator(**settings).rollout(
+        state, STEPS, Inputs(forces[:, rows]), {"youngs_modulus": modulus[rows]}
+    )
 
 
 @pytest.mark.parametrize(
-    ("name", "linear_solver"), [("newton", "sparse"), ("quasi_newton", "tiled"), ("quasi_newton", "banded")]
+    ("name", "linear_solver"),
+    [("newton", "sparse"), ("quasi_newton", "tiled"), ("quasi_newton", "banded")],
 )
 def test_an_environment_does_what_it_does_alone(motion, name, linear_solver):
     """Its directions, line searches and factors are its own: nothing depends on its neighbours."""
@@ -77,11 +98,16 @@ def test_threads_change_nothing(motion, monkeypatch, count, linear_solver):
         assert len(sim.workspace(SIZE).shards) == (0 if number == 1 else count)
         start, forces, modulus = motion
         leaves = [
-            t.clone().requires_grad_() for t in (start.q, start.v, forces, modulus, torch.tensor([1000.0]).double())
+            t.clone().requires_grad_()
+            for t in (start.q, start.v, forces, modulus, torch.tensor([1000.0]).double())
         ]
         q, v, f, e, density = leaves
-        trajectory = sim.rollout(State(q, v), STEPS, Inputs(f), {"youngs_modulus": e, "density": density})
-        gradients = torch.autograd.grad(trajectory.q[-1].square().sum() + trajectory.v[-1].sum(), leaves)
+        trajectory = sim.rollout(
+            State(q, v), STEPS, Inputs(f), {"youngs_modulus": e, "density": density}
+        )
+        gradients = torch.autograd.grad(
+            trajectory.q[-1].square().sum() + trajectory.v[-1].sum(), leaves
+        )
         report = trajectory.reports[-1]
         results.append((trajectory.q, report.iterations, report.relative_residual, *gradients))
     shards = [own.potential for _, own in sim.workspace(SIZE).shards]
@@ -124,7 +150,9 @@ def test_results_are_in_the_order_of_the_shards(monkeypatch):
 
 def test_shards_are_not_shared_again(monkeypatch):
     threads(monkeypatch, 4)
-    inner = in_threads(lambda _: (shards_of(8, torch.device("cpu")), in_threads(lambda n: n, [1, 2])), range(3))
+    inner = in_threads(
+        lambda _: (shards_of(8, torch.device("cpu")), in_threads(lambda n: n, [1, 2])), range(3)
+    )
     assert inner == [([], [1, 2])] * 3
     assert len(shards_of(8, torch.device("cpu"))) == 4
 
@@ -149,7 +177,8 @@ def test_a_batch_is_shared_by_as_many_threads_as_torch_has(motion, monkeypatch):
     with threads_for(1):
         assert torch.get_num_threads() == 1
         with threads_for(1, shards=2):
-            assert len(simulator().workspace(SIZE).shards) == 3  # also in steps within a reconstruction's
+            # Also in steps within a reconstruction's.
+            assert len(simulator().workspace(SIZE).shards) == 3
         assert thread_count() == 3
     torch.set_num_threads(2)
     assert thread_count() == 2
@@ -162,7 +191,9 @@ def test_a_simulator_first_used_within_a_shard_shares_later_batches(monkeypatch)
     assert len(sim.workspace(SIZE).shards) == 2
 
 
-@pytest.mark.parametrize(("name", "limit"), [("quasi_newton", 1), ("newton", 2), ("projective_dynamics", 3)])
+@pytest.mark.parametrize(
+    ("name", "limit"), [("quasi_newton", 1), ("newton", 2), ("projective_dynamics", 3)]
+)
 def test_no_environment_has_more_iterations_than_the_limit(name, limit):
     sim = simulator(name=name, max_iterations=limit, on_failure="count")
     rest = sim.rest_state(3)
@@ -190,7 +221,9 @@ MATERIAL = Corotated(1e5, 0.45, density=1000.0, stiffness_damping=1e-3)
 
 
 def on_device(name, device, material=MATERIAL, **settings):
-    chosen = SolverSettings(name=name, linear_solver="tiled", **({"relative_tolerance": 1e-9} | settings))
+    chosen = SolverSettings(
+        name=name, linear_solver="tiled", **({"relative_tolerance": 1e-9} | settings)
+    )
     return Simulator(BODY, material, solver=chosen, device=device)
 
 
@@ -234,7 +267,9 @@ def host(monkeypatch):
 )
 def test_the_loop_on_the_device_is_that_of_the_host(name, start, tolerance, factors, host, device):
     def rolled():
-        s = on_device(name, device, relative_tolerance=tolerance, factors=factors, max_iterations=500)
+        s = on_device(
+            name, device, relative_tolerance=tolerance, factors=factors, max_iterations=500
+        )
         trajectory = s.rollout(start(s), 8)
         return trajectory.final, trajectory.reports
 
@@ -265,7 +300,9 @@ def test_a_solve_is_one_launch(monkeypatch, device):
     launches = []
     launch = IncrementalPotential.launch
     monkeypatch.setattr(
-        IncrementalPotential, "launch", lambda self, *commands: launches.append(commands) or launch(self, *commands)
+        IncrementalPotential,
+        "launch",
+        lambda self, *commands: launches.append(commands) or launch(self, *commands),
     )
     s.step(start)
     assert len(launches) == 1

@@ -1,4 +1,7 @@
-"""Half of a symmetric body between symmetry planes moves like the whole one; the forces of the planes."""
+"""Half of a symmetric body between symmetry planes moves like the whole one.
+
+The forces of the planes.
+"""
 
 import math
 
@@ -38,13 +41,21 @@ def turned(points, angle):
 
 
 def beam(half, angle=0.0, rigid=False, stiffness=1e9):
-    """A beam of four cells across, or its half y < 15 mm behind a symmetry plane, turned about its axis."""
+    """A beam of four cells across, or its half y < 15 mm behind a symmetry plane,
+    turned about its axis.
+    """
     size, cells = ((SIZE[0], 0.015, SIZE[2]), (6, 2, 2)) if half else (SIZE, (6, 4, 2))
     mesh = box_hexahedra(size, cells)
-    regions = {"cap": np.flatnonzero(mesh.vertices[mesh.cells].mean(1)[:, 0] > 0.08)} if rigid else {}
+    regions = (
+        {"cap": np.flatnonzero(mesh.vertices[mesh.cells].mean(1)[:, 0] > 0.08)} if rigid else {}
+    )
     mesh = Mesh(turned(mesh.vertices, angle), mesh.cells, regions)
     planes = [SymmetryPlane(turned([0.0, 1.0, 0.0], angle), 0.015)] if half else []
-    return clamped(mesh, rigid={"cap": Rigid(density=1200.0, stiffness=stiffness)} if rigid else {}, symmetry=planes)
+    return clamped(
+        mesh,
+        rigid={"cap": Rigid(density=1200.0, stiffness=stiffness)} if rigid else {},
+        symmetry=planes,
+    )
 
 
 def simulator(body, angle=0.0, solver=TIGHT, **more):
@@ -54,7 +65,11 @@ def simulator(body, angle=0.0, solver=TIGHT, **more):
 
 @pytest.mark.parametrize(
     ("solver", "linear", "angle", "rigid"),
-    [("newton", "banded", 0.0, False), ("quasi_newton", "auto", TURN, True), ("newton", "sparse", TURN, False)],
+    [
+        ("newton", "banded", 0.0, False),
+        ("quasi_newton", "auto", TURN, True),
+        ("newton", "sparse", TURN, False),
+    ],
 )
 def test_half_a_beam_swings_like_the_whole_one(solver, linear, angle, rigid):
     settings = SolverSettings(name=solver, relative_tolerance=1e-11, linear_solver=linear)
@@ -74,11 +89,22 @@ def test_half_a_beam_swings_like_the_whole_one(solver, linear, angle, rigid):
 def test_gradients_of_half_a_beam():
     # Differences are less exact by rounding, the stiffer the cap.
     rows = check_gradients(simulator(beam(True, TURN, rigid=True, stiffness=1e6)), POSES[-1])
-    check_rows(rows, "q", "v", "external_force", "youngs_modulus", "cap_density, each environment", bound=1e-7)
+    check_rows(
+        rows,
+        "q",
+        "v",
+        "external_force",
+        "youngs_modulus",
+        "cap_density, each environment",
+        bound=1e-7,
+    )
 
 
 def test_the_plane_across_a_beam_holds_its_stress_times_its_area():
-    """An eighth of a beam without lateral contraction, stretched by 10 %: E / 10. The other planes hold nothing."""
+    """An eighth of a beam without lateral contraction, stretched by 10 %: E / 10.
+
+    The other planes hold nothing.
+    """
     mesh = box_hexahedra(SIZE, (5, 2, 2))
     ends = select_vertices(mesh, x=SIZE[0])
     mesh = Mesh(turned(mesh.vertices, TURN), mesh.cells)
@@ -93,7 +119,9 @@ def test_the_plane_across_a_beam_holds_its_stress_times_its_area():
     about, middle = np.array([0.02, -0.01, 0.03]), turned([0.0, SIZE[1] / 2.0, SIZE[2] / 2.0], TURN)
     moment = np.cross(middle - about, force)
     assert held.moment(about)[0].numpy() == pytest.approx(moment, rel=1e-8, abs=1e-10 * size)
-    assert sim.reaction(state, sim.fixed).force[0].numpy() == pytest.approx(-force, rel=1e-8, abs=1e-8 * size)
+    assert sim.reaction(state, sim.fixed).force[0].numpy() == pytest.approx(
+        -force, rel=1e-8, abs=1e-8 * size
+    )
     for plane in along:
         assert float(sim.reaction(state, plane).forces.abs().max()) < 1e-8 * size
 
@@ -101,9 +129,12 @@ def test_the_plane_across_a_beam_holds_its_stress_times_its_area():
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
 def test_clamps_and_planes_give_the_rate_of_change_of_the_momentum(integrator):
     """Of half a beam that is pushed, also against its plane, and heavy towards it."""
-    sim = Simulator(beam(True, TURN), SOFT, gravity=(1.0, -4.0, -9.0), solver=TIGHT, integrator=integrator)
+    sim = Simulator(
+        beam(True, TURN), SOFT, gravity=(1.0, -4.0, -9.0), solver=TIGHT, integrator=integrator
+    )
     constants, state = sim.prepare(), sim.rest_state()
-    mass, weight = constants.mass[..., None], constants.load_mass[..., None] * constants.gravity[:, None]
+    mass = constants.mass[..., None]
+    weight = constants.load_mass[..., None] * constants.gravity[:, None]
     for push in 1e-3 * noise(4, 1, sim.body.n_vertices, 3):
         after = sim.step(state, Inputs(external_force=push))
         change, velocity = after.v - state.v, after.v
@@ -115,7 +146,9 @@ def test_clamps_and_planes_give_the_rate_of_change_of_the_momentum(integrator):
         expected = (rate - weight - push).sum(1)
         (plane,) = sim.body.symmetry
         reactions = [sim.reaction(after, at).force for at in (sim.fixed, plane)]
-        torch.testing.assert_close(sum(reactions), expected, rtol=0.0, atol=1e-9 * float(expected.norm()))
+        torch.testing.assert_close(
+            sum(reactions), expected, rtol=0.0, atol=1e-9 * float(expected.norm())
+        )
         assert abs(float(reactions[1] @ sim.tensor(turned([1.0, 0.0, 0.0], TURN)))) < 1e-15
         assert float(reactions[1].norm()) > 1e-3
         state = after
@@ -130,20 +163,31 @@ def test_half_a_beam_with_a_rigid_cap_is_held_like_the_whole_one():
     (plane,) = beam(True, TURN).symmetry
     middle = sim.tensor(plane.offset * np.asarray(plane.normal))
     force, moment = loads[0].split(3, -1)
-    moment = moment - torch.linalg.cross(middle.expand_as(force), force)  # about the middle, where halves are mirrored
+    # About the middle, where halves are mirrored.
+    moment = moment - torch.linalg.cross(middle.expand_as(force), force)
     normal = sim.tensor(plane.normal)
     force = 2.0 * (force - (force @ normal)[:, None] * normal)
-    moment = 2.0 * (moment @ normal)[:, None] * normal + torch.linalg.cross(middle.expand_as(force), force)
-    torch.testing.assert_close(force, loads[1][:, :3], rtol=0.0, atol=1e-7 * float(loads[1][:, :3].norm(dim=1).max()))
-    torch.testing.assert_close(moment, loads[1][:, 3:], rtol=0.0, atol=1e-7 * float(loads[1][:, 3:].norm(dim=1).max()))
+    moment = 2.0 * (moment @ normal)[:, None] * normal + torch.linalg.cross(
+        middle.expand_as(force), force
+    )
+    torch.testing.assert_close(
+        force, loads[1][:, :3], rtol=0.0, atol=1e-7 * float(loads[1][:, :3].norm(dim=1).max())
+    )
+    torch.testing.assert_close(
+        moment, loads[1][:, 3:], rtol=0.0, atol=1e-7 * float(loads[1][:, 3:].norm(dim=1).max())
+    )
 
 
 @pytest.mark.parametrize("static", [False, True])
 def test_gradients_of_what_planes_exert(static):
-    """With a spring of a tendon that couples all cells, loads against the planes, and velocities towards them."""
+    """With a spring of a tendon that couples all cells,
+    loads against the planes, and velocities towards them.
+    """
     mesh = box_hexahedra((0.06, 0.015, 0.015), (3, 1, 1))
     planes = [SymmetryPlane((0.0, 1.0, 0.0)), SymmetryPlane((0.0, math.sin(TURN), -math.cos(TURN)))]
-    mesh = Mesh(mesh.vertices + np.outer(mesh.vertices[:, 1], [0.0, 0.0, math.tan(TURN)]), mesh.cells)
+    mesh = Mesh(
+        mesh.vertices + np.outer(mesh.vertices[:, 1], [0.0, 0.0, math.tan(TURN)]), mesh.cells
+    )
     routes = {"top": [[x, 0.012, 0.014] for x in (0.0, 0.03, 0.06)]}
     body = clamped(mesh, symmetry=planes, energies=[Tendons(routes, stiffness=300.0)])
     sim = Simulator(body, SOFT, solver=TIGHT, integrator="bdf2")
@@ -151,7 +195,10 @@ def test_gradients_of_what_planes_exert(static):
 
     def loss(given):
         inputs = Inputs(tendon_contraction=given["pull"], external_force=given["force"])
-        parameters = {"youngs_modulus": given["youngs_modulus"], "tendon_stiffness": given["stiffness"]}
+        parameters = {
+            "youngs_modulus": given["youngs_modulus"],
+            "tendon_stiffness": given["stiffness"],
+        }
         if static:
             state = sim.static_equilibrium(inputs, parameters)
         else:
@@ -159,7 +206,9 @@ def test_gradients_of_what_planes_exert(static):
             state = sim.step(state, inputs, parameters)
         total = (state.reaction.forces * weights[0][state.reaction.vertices]).sum((1, 2))
         for number, plane in enumerate(planes):
-            total = total + (20.0 + number) * sim.reaction(state, plane).moment((0.01, 0.0, 0.02)).sum(1)
+            total = total + (20.0 + number) * sim.reaction(state, plane).moment(
+                (0.01, 0.0, 0.02)
+            ).sum(1)
         return total + 100.0 * (state.q * weights[1]).sum((1, 2))
 
     values = {
@@ -170,27 +219,45 @@ def test_gradients_of_what_planes_exert(static):
         "v": 0.1 * noise(2, *weights[0].shape, seed=2),
     }
     sizes = {"youngs_modulus": 30.0, "stiffness": 0.1, "pull": 1e-5, "force": 1e-4, "v": 1e-4}
-    check_slopes(loss, {name: value for name, value in values.items() if not static or name != "v"}, sizes)
+    check_slopes(
+        loss, {name: value for name, value in values.items() if not static or name != "v"}, sizes
+    )
 
 
-def test_a_batch_is_what_its_environments_are_alone_and_near_in_single_precision(monkeypatch, device):
+def test_a_batch_is_what_its_environments_are_alone_and_near_in_single_precision(
+    monkeypatch, device
+):
     monkeypatch.setenv("WARP_RESPHYS_THREADS", "2")
     pushes, runs = 1e-2 * noise(3, len(beam(True).vertices), 3), []
     for dtype in (torch.float64, torch.float32):
-        sim = simulator(beam(True, TURN), TURN, SolverSettings(relative_tolerance=1e-5), device=device, dtype=dtype)
+        sim = simulator(
+            beam(True, TURN),
+            TURN,
+            SolverSettings(relative_tolerance=1e-5),
+            device=device,
+            dtype=dtype,
+        )
         start, push = sim.rest_state(3), sim.tensor(pushes)
         (plane,) = sim.body.symmetry
         runs.append(sim.reaction(sim.step(start, Inputs(external_force=push)), plane).force)
         for b in range(3):
             alone = sim.step(start.select([b]), Inputs(external_force=push[b : b + 1]))
             assert torch.equal(runs[-1][b], sim.reaction(alone, plane).force[0])
-    torch.testing.assert_close(*(run.double() for run in runs), rtol=0.0, atol=1e-3 * float(runs[0].abs().max()))
+    torch.testing.assert_close(
+        *(run.double() for run in runs), rtol=0.0, atol=1e-3 * float(runs[0].abs().max())
+    )
 
 
 def test_planes_that_hold_nothing_are_refused():
     sim = simulator(beam(True))
     state = sim.step(sim.rest_state())
-    refuses(InputError, "choose one of the body's `symmetry`", sim.reaction, state, SymmetryPlane((0.0, 0.0, 1.0)))
+    refuses(
+        InputError,
+        "choose one of the body's `symmetry`",
+        sim.reaction,
+        state,
+        SymmetryPlane((0.0, 0.0, 1.0)),
+    )
 
 
 BOX = box_hexahedra(SIZE, (10, 4, 4))
@@ -205,11 +272,16 @@ NAMED = Mesh(BOX.vertices, BOX.cells, {"cap": np.arange(144, 160), "beam": np.ar
         (lambda: Body(BOX, symmetry=[SymmetryPlane((0.0, 1.0, 0.0), 0.5)]), "offset 0.5 m"),
         (
             lambda: Body(
-                NAMED, rigid={"cap": Rigid()}, symmetry=[SymmetryPlane((0, 1, 0)), SymmetryPlane((0, 1, 0), 0.03)]
+                NAMED,
+                rigid={"cap": Rigid()},
+                symmetry=[SymmetryPlane((0, 1, 0)), SymmetryPlane((0, 1, 0), 0.03)],
             ),
             "'cap'",
         ),
-        (lambda: simulator(beam(True), solver=SolverSettings(name="projective_dynamics")), "projective_dynamics"),
+        (
+            lambda: simulator(beam(True), solver=SolverSettings(name="projective_dynamics")),
+            "projective_dynamics",
+        ),
     ],
 )
 def test_invalid_symmetry_is_refused(make, key):

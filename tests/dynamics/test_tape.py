@@ -7,7 +7,15 @@ import torch
 import warp as wp
 
 from support.clamped import clamped
-from warp_resphys import Corotated, InputError, Inputs, Simulator, State, box_hexahedra, record_rollout
+from warp_resphys import (
+    Corotated,
+    InputError,
+    Inputs,
+    Simulator,
+    State,
+    box_hexahedra,
+    record_rollout,
+)
 
 BATCH, STEPS = 2, 3
 
@@ -57,11 +65,15 @@ def test_gradients_equal_those_of_torch(device, integrator):
     loss = (weights[0] * trajectory.q).sum() + (weights[1] * trajectory.v).sum()
     expected = torch.autograd.grad(loss, list(leaves.values()))
 
-    arrays = {name: array(value, wp.vec3d if value.ndim > 2 else wp.float64) for name, value in inputs.items()}
+    arrays = {
+        name: array(value, wp.vec3d if value.ndim > 2 else wp.float64)
+        for name, value in inputs.items()
+    }
     tape = wp.Tape()
     path, speeds = record_rollout(
         tape,
-        make_simulator(device, integrator),  # a fresh one, with no factor left from the roll-out above
+        # a fresh one, with no factor left from the roll-out above
+        make_simulator(device, integrator),
         arrays["q"],
         arrays["v"],
         STEPS,
@@ -107,7 +119,9 @@ def test_a_dropped_tape_leaves_nothing_behind(device):
     state = simulator.rest_state(BATCH)
     tape = wp.Tape()
     force = array(0.0 * state.q)
-    path, speeds = record_rollout(tape, simulator, array(state.q), array(state.v), 1, inputs={"external_force": force})
+    path, speeds = record_rollout(
+        tape, simulator, array(state.q), array(state.v), 1, inputs={"external_force": force}
+    )
     path.grad.fill_(1.0)
     tape.backward()
     assert force.grad.numpy().any()
@@ -120,7 +134,10 @@ def test_a_dropped_tape_leaves_nothing_behind(device):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda q, v: (wp.zeros(q.shape, dtype=wp.vec3f, device=q.device), v), "q must be a Warp array of vec3d"),
+        (
+            lambda q, v: (wp.zeros(q.shape, dtype=wp.vec3f, device=q.device), v),
+            "q must be a Warp array of vec3d",
+        ),
         (lambda q, v: (q, v[:1]), "state.v has shape"),
     ],
 )

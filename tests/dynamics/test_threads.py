@@ -1,4 +1,7 @@
-"""A simulator in threads and processes: every call returns what it returns alone; copies give the same motion."""
+"""A simulator in threads and processes: every call returns what it returns alone.
+
+Copies give the same motion.
+"""
 
 import copy
 import io
@@ -13,7 +16,16 @@ import pytest
 import torch
 
 from support.clamped import clamped
-from warp_resphys import Body, Contact, Corotated, HalfSpace, Inputs, Simulator, box_hexahedra, select_vertices
+from warp_resphys import (
+    Body,
+    Contact,
+    Corotated,
+    HalfSpace,
+    Inputs,
+    Simulator,
+    box_hexahedra,
+    select_vertices,
+)
 from warp_resphys.energies.convex_material import ConvexMaterial
 from warp_resphys.studies.check import MOTIONS, positions
 
@@ -24,7 +36,9 @@ FLOOR = Contact({"floor": HalfSpace(position=(0.0, 0.0, -0.002))}, distance=0.00
 
 
 def simulator(*energies):
-    return Simulator(clamped(MESH, energies=energies), Corotated(100e3, 0.45, stiffness_damping=2e-3))
+    return Simulator(
+        clamped(MESH, energies=energies), Corotated(100e3, 0.45, stiffness_damping=2e-3)
+    )
 
 
 def loss(sim, number, modulus):
@@ -50,7 +64,9 @@ def test_threads_have_the_results_of_one(count, energies):
     alone = [results(sim, number) for number in range(8)]
     assert len(set(alone)) == 8
     with ThreadPoolExecutor(count) as pool:
-        np.testing.assert_allclose(list(pool.map(lambda number: results(sim, number), range(8))), alone, **CLOSE)
+        np.testing.assert_allclose(
+            list(pool.map(lambda number: results(sim, number), range(8))), alone, **CLOSE
+        )
     assert 1 < len({thread for thread, *_ in sim._equations.workspaces}) <= count + 1
 
 
@@ -87,7 +103,9 @@ with ThreadPoolExecutor(4) as pool:
 
 @pytest.mark.slow
 def test_the_first_use_may_be_in_several_threads(pytestconfig):
-    """Warp loads modules and captures graphs for the whole process: of one simulator and of several."""
+    """Warp loads modules and captures graphs for the whole process:
+    of one simulator and of several.
+    """
     folder = pytestconfig.rootpath / "tests"
     command = [sys.executable, "-c", FIRST_USE]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
@@ -97,7 +115,9 @@ def test_the_first_use_may_be_in_several_threads(pytestconfig):
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux")
 @pytest.mark.parametrize("divisions", [(6, 2, 2), (24, 12, 12)])
 def test_a_forked_process_uses_the_simulator(divisions, monkeypatch):
-    """With threads for the shards of a batch, and those of torch for a large body, neither of which it inherits."""
+    """With threads for the shards of a batch, and those of torch for a large body,
+    neither of which it inherits.
+    """
     monkeypatch.setenv("WARP_RESPHYS_THREADS", "2")
     before = torch.get_num_threads()
     torch.set_num_threads(2)
@@ -127,12 +147,19 @@ def saved(thing):
     return torch.load(file, weights_only=False)
 
 
-WAYS = {"pickle": lambda x: pickle.loads(pickle.dumps(x)), "deepcopy": copy.deepcopy, "copy": copy.copy, "save": saved}
+WAYS = {
+    "pickle": lambda x: pickle.loads(pickle.dumps(x)),
+    "deepcopy": copy.deepcopy,
+    "copy": copy.copy,
+    "save": saved,
+}
 
 
 @pytest.mark.parametrize("name", MOTIONS)
 def test_copies_of_a_used_simulator_move_as_it_does(name, recwarn):
-    """Copies, for every kind of energy, leave buffers, factors and Warp's arrays behind, and repeat no warning."""
+    """Copies, for every kind of energy, leave buffers,
+    factors and Warp's arrays behind, and repeat no warning.
+    """
     sim = MOTIONS[name][0]()
     expected = positions(sim)
     copies = {way: make(sim) for way, make in WAYS.items()}

@@ -1,4 +1,6 @@
-"""Trajectories as files and pictures, inputs as numbers and lists, batches of one, and what Python prints."""
+"""Trajectories as files and pictures, inputs as numbers and lists,
+batches of one, and what Python prints.
+"""
 
 import h5py
 import matplotlib.pyplot as plt
@@ -38,7 +40,12 @@ def trajectory():
 
 def test_a_file_has_times_and_units(trajectory, tmp_path):
     with h5py.File(trajectory.save(tmp_path / "run" / "beam.h5")) as file:
-        assert {name: file[name].attrs["units"] for name in file} == {"times": "s", "q": "m", "v": "m/s", "rest": "m"}
+        assert {name: file[name].attrs["units"] for name in file} == {
+            "times": "s",
+            "q": "m",
+            "v": "m/s",
+            "rest": "m",
+        }
         assert np.array_equal(file["q"], trajectory.q.numpy())
         assert np.array_equal(file["v"], trajectory.v.numpy())
         assert np.allclose(file["times"], [0.0, 0.01, 0.02, 0.03])
@@ -58,11 +65,20 @@ def test_a_series_for_paraview_has_every_step(trajectory, tmp_path):
 def test_a_table_and_a_plot_have_force_and_moment_of_the_clamp(trajectory, tmp_path):
     plain = trajectory.write_csv(tmp_path / "beam.csv").read_text().splitlines()[0].split(",")
     path = trajectory.write_csv(tmp_path / "loads.csv", reaction=True)
-    titles = ["load.fx [N]", "load.fy [N]", "load.fz [N]", "load.tx [N m]", "load.ty [N m]", "load.tz [N m]"]
+    titles = [
+        "load.fx [N]",
+        "load.fy [N]",
+        "load.fz [N]",
+        "load.tx [N m]",
+        "load.ty [N m]",
+        "load.tz [N m]",
+    ]
     assert path.read_text().splitlines()[0].split(",") == [*plain, *titles]
     loads = np.genfromtxt(path, delimiter=",", skip_header=1)[:, -6:]
     assert np.isnan(loads[0]).all()
-    expected = torch.cat([trajectory.reaction.force, trajectory.reaction.moment()], -1)[:, 0].numpy()
+    expected = torch.cat([trajectory.reaction.force, trajectory.reaction.moment()], -1)[
+        :, 0
+    ].numpy()
     np.testing.assert_allclose(loads[1:], expected, rtol=1e-11)
     np.testing.assert_allclose(read_recording(path).loads["load"][1:], expected, rtol=1e-11)
     axes = trajectory.plot(reaction=True)
@@ -71,7 +87,13 @@ def test_a_table_and_a_plot_have_force_and_moment_of_the_clamp(trajectory, tmp_p
         np.testing.assert_allclose(line.get_ydata()[1:], expected[:, column])
     plt.close(axes.figure)
     free = Simulator(Body(MESH))
-    refuses(InputError, "has no reaction", free.rollout(free.rest_state(), 1).write_csv, path, reaction=True)
+    refuses(
+        InputError,
+        "has no reaction",
+        free.rollout(free.rest_state(), 1).write_csv,
+        path,
+        reaction=True,
+    )
 
 
 PLATE = Box(position=(0.09, 0.01, -0.015), edges=(0.02, 0.04, 0.02), moves=True)
@@ -79,19 +101,36 @@ BALL = Sphere(position=(0.05, 0.01, -0.05), radius=0.01)
 
 
 def test_obstacles_are_in_the_series_where_they_are_at_the_end_of_every_step(tmp_path):
-    """A plate that rises and turns, and a ball whose place and size are parameters, by environment."""
-    simulator = Simulator(clamped(MESH, energies=[Contact({"ball": BALL, "plate": PLATE})]), time_step=0.01)
-    ways = torch.arange(1, 4, dtype=torch.float64)[:, None, None] * torch.tensor([[0.0, 2e-4], [0.0, 5e-4]])
+    """A plate that rises and turns, and a ball whose place
+    and size are parameters, by environment.
+    """
+    simulator = Simulator(
+        clamped(MESH, energies=[Contact({"ball": BALL, "plate": PLATE})]), time_step=0.01
+    )
+    ways = torch.arange(1, 4, dtype=torch.float64)[:, None, None] * torch.tensor(
+        [[0.0, 2e-4], [0.0, 5e-4]]
+    )
     inputs = {"obstacle_move_z": ways, "obstacle_rotate_y": -20.0 * ways}
-    given = {"obstacle_x": torch.tensor([[0.0, 0.0], [0.02, 0.0]]), "obstacle_growth": torch.tensor([[2e-3], [0.0]])}
+    given = {
+        "obstacle_x": torch.tensor([[0.0, 0.0], [0.02, 0.0]]),
+        "obstacle_growth": torch.tensor([[2e-3], [0.0]]),
+    }
     given = {name: value.double() for name, value in given.items()}
     moved = simulator.rollout(simulator.rest_state(2), 3, Inputs(**inputs), given)
     for environment in range(2):
-        series = moved.write_vtk(tmp_path / f"{environment}.pvd", environment).with_name(f"{environment}_obstacles.pvd")
+        series = moved.write_vtk(tmp_path / f"{environment}.pvd", environment).with_name(
+            f"{environment}_obstacles.pvd"
+        )
         assert series.read_text(encoding="utf-8").count("<DataSet") == 4
-        placed = {"obstacle_x_ball": 0.02 * environment, "obstacle_growth": 2e-3 * (1 - environment)}
+        placed = {
+            "obstacle_x_ball": 0.02 * environment,
+            "obstacle_growth": 2e-3 * (1 - environment),
+        }
         surface = ObstacleSurface.of(simulator.body, placed)
-        begun = {name: np.concatenate([np.zeros((1, 2)), x[:, environment]]) for name, x in inputs.items()}
+        begun = {
+            name: np.concatenate([np.zeros((1, 2)), x[:, environment]])
+            for name, x in inputs.items()
+        }
         expected = surface.moved(begun)
         for step in range(4):
             file = meshio.read(tmp_path / series.stem / f"{series.stem}_{step}.vtu")
@@ -106,7 +145,9 @@ def test_a_plot_without_choices_shows_the_vertex_that_moves_furthest_along_its_w
     axes = trajectory.plot()
     (line,), axis = axes.lines, "xyz"[np.abs(moved[:, furthest]).max(0).argmax()]
     assert axes.get_ylabel() == f"displacement along {axis} [mm]"
-    np.testing.assert_allclose(line.get_ydata(), 1e3 * moved[:, furthest, "xyz".index(axis)], atol=1e-9)
+    np.testing.assert_allclose(
+        line.get_ydata(), 1e3 * moved[:, furthest, "xyz".index(axis)], atol=1e-9
+    )
     plt.close(axes.figure)
 
 
@@ -124,13 +165,15 @@ def test_what_is_not_there_is_refused(trajectory, call, message):
 
 
 def test_a_batch_of_one_needs_no_axis():
-    force, tension = torch.zeros(20, 3, dtype=torch.float64), torch.tensor([0.5], dtype=torch.float64)
+    force = torch.zeros(20, 3, dtype=torch.float64)
+    tension = torch.tensor([0.5], dtype=torch.float64)
     force[TIP, 1] = 0.01
     rest, velocity = SIMULATOR.rest_positions, torch.full((20, 3), 0.01, dtype=torch.float64)
     velocity[SIMULATOR.fixed] = 0.0
     bare = SIMULATOR.step(SIMULATOR.state(rest, velocity), Inputs(force, tendon_tension=tension))
     batched = SIMULATOR.step(
-        SIMULATOR.state(rest[None].numpy(), velocity[None]), Inputs(force[None], tendon_tension=tension[None])
+        SIMULATOR.state(rest[None].numpy(), velocity[None]),
+        Inputs(force[None], tendon_tension=tension[None]),
     )
     assert torch.equal(bare.q, batched.q)
     assert bare.q.shape == (1, 20, 3)
@@ -138,7 +181,13 @@ def test_a_batch_of_one_needs_no_axis():
     assert Inputs(fixed_positions=clamp).fixed_positions.shape == (1, *clamp.shape)
     assert Inputs(attached_mass=torch.zeros(20)).attached_mass.shape == (1, 20)
     refuses(InputError, "q has shape", SIMULATOR.state, rest[:5])
-    refuses(InputError, "external_force has shape", SIMULATOR.step, SIMULATOR.rest_state(batch=2), Inputs(force))
+    refuses(
+        InputError,
+        "external_force has shape",
+        SIMULATOR.step,
+        SIMULATOR.rest_state(batch=2),
+        Inputs(force),
+    )
 
 
 ROUTES = [[[x, 0.01, z] for x in (0.0, 0.05, 0.1)] for z in (0.002, 0.018)]
@@ -166,7 +215,9 @@ def test_numbers_and_lists_are_for_every_environment(dtype, batch):
         assert torch.equal(path.q, other.q)
     rest = simulator.static_equilibrium(Inputs(tendon_tension=0.2), batch=batch).q
     assert rest.shape[0] == batch
-    assert torch.equal(rest, simulator.static_equilibrium(Inputs(tendon_tension=simulator.tensor(cases[0][1]))).q)
+    assert torch.equal(
+        rest, simulator.static_equilibrium(Inputs(tendon_tension=simulator.tensor(cases[0][1]))).q
+    )
     force = np.zeros((len(MESH.vertices), 3))
     force[-1, 2] = 0.01
     moved = simulator.step(start, Inputs(external_force=force)).q
@@ -177,7 +228,10 @@ def test_numbers_and_lists_are_for_every_environment(dtype, batch):
     ("given", "message"),
     [
         ({"tendon_tension": "much"}, "tendon_tension is 'much'"),
-        ({"external_force": [0.0, 0.0, -1.0]}, r"external_force has shape \(3,\): it must be \(N, 3\)"),
+        (
+            {"external_force": [0.0, 0.0, -1.0]},
+            r"external_force has shape \(3,\): it must be \(N, 3\)",
+        ),
         ({"fixed_positions": 1.0}, r"fixed_positions has shape \(\)"),
         ({"attached_mass": 0.1}, r"attached_mass has shape \(\): .* a mass for every vertex"),
         ({"tendon_tension": [torch.ones(2), torch.ones(2)]}, "list with tensors"),
@@ -200,8 +254,13 @@ def test_simulations_are_printed_in_a_line():
     path = simulator.rollout(simulator.rest_state(), 2, inputs)
     scene = Scene({"a": simulator.body, "b": Body.rigid_body(MESH)}, SurfaceContact(distance=1e-4))
     body = "Body(Mesh(20 vertices, 4 cells: hexahedron), 4 fixed vertices, Tendons)"
-    assert repr(simulator) == f"Simulator({body}, Corotated, 10 ms, implicit_euler, torch.float64, cpu)"
+    assert (
+        repr(simulator)
+        == f"Simulator({body}, Corotated, 10 ms, implicit_euler, torch.float64, cpu)"
+    )
     assert repr(path.final).startswith("State(q (1, 20, 3), v (1, 20, 3)")
     assert repr(path) == "Motion: 2 steps of 10 ms, 1 environment, q (3, 1, 20, 3)"
     assert repr(inputs) == "Inputs(tendon_tension (1, 2))"
-    assert repr(scene).startswith(f"Scene(a: {body}, b: Body(Mesh(20 vertices, 4 cells: hexahedron, regions body)")
+    assert repr(scene).startswith(
+        f"Scene(a: {body}, b: Body(Mesh(20 vertices, 4 cells: hexahedron, regions body)"
+    )

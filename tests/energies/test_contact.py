@@ -1,4 +1,6 @@
-"""Contact with rigid obstacles: shapes, barrier, Coulomb's friction, gradients, moved obstacles, refusals."""
+"""Contact with rigid obstacles: shapes, barrier, Coulomb's friction,
+gradients, moved obstacles, refusals.
+"""
 
 import math
 from dataclasses import replace
@@ -12,7 +14,16 @@ from support.contact import BLOCK, KAPPA, SIDE, SOFT, WEIGHT, D, G, distances, r
 from support.contact import on_obstacles as simulator
 from support.refusals import refuses
 from support.slopes import check_slopes
-from warp_resphys import Body, Corotated, Inputs, Simulator, State, SymmetryPlane, box_hexahedra, box_tetrahedra
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Simulator,
+    State,
+    SymmetryPlane,
+    box_hexahedra,
+    box_tetrahedra,
+)
 from warp_resphys.energies.contact.contact_points import vertex_areas, vertex_factors
 from warp_resphys.energies.contact.obstacle_contact import Contact
 from warp_resphys.energies.contact.obstacle_poses import ObstacleSet, Pose
@@ -40,16 +51,23 @@ def vector(*values):
 
 def measured(obstacle, x):
     """Distances (P,) and normals (P, 3) of positions (P, 3)."""
-    pose = Pose(vector(obstacle.position)[None], torch.as_tensor(obstacle.turn)[None, None], vector([0.0]))
+    pose = Pose(
+        vector(obstacle.position)[None], torch.as_tensor(obstacle.turn)[None, None], vector([0.0])
+    )
     return (value[0, :, 0] for value in ObstacleSet((obstacle,), D, CPU).distances(x[None], pose))
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_distances_and_normals_within_and_around_a_shape(shape):
-    """Normals lead to the surface: x - d n lies on it; they are continuous outside, where regions of a shape meet."""
+    """Normals lead to the surface: x - d n lies on it.
+
+    They are continuous outside, where regions of a shape meet.
+    """
     obstacle = SHAPES[shape]
     assert obstacle.turn.T @ obstacle.turn == pytest.approx(np.eye(3), abs=1e-15)
-    assert obstacle.turn[:, 2] == pytest.approx(np.array(PLACED["axis"]) / np.linalg.norm(PLACED["axis"]))
+    assert obstacle.turn[:, 2] == pytest.approx(
+        np.array(PLACED["axis"]) / np.linalg.norm(PLACED["axis"])
+    )
     x = torch.as_tensor(np.random.default_rng(0).normal(size=(4000, 3)) * 0.025 + obstacle.position)
     d, n = measured(obstacle, x)
     np.testing.assert_allclose(d, distances(obstacle, x.numpy()), atol=1e-15)
@@ -62,12 +80,15 @@ def test_distances_and_normals_within_and_around_a_shape(shape):
     apart = torch.minimum(d, further) > 1e-4
     size = ways.norm(dim=-1)
     assert bool(((turned - n).norm(dim=-1) <= 2.0 * size / torch.minimum(d, further))[apart].all())
-    assert bool((d + (n * ways).sum(-1) <= further + 1e-15).all())  # convexity, on which bounds of steps rely
+    # Convexity, on which bounds of steps rely.
+    assert bool((d + (n * ways).sum(-1) <= further + 1e-15).all())
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_derivatives_of_distances_and_normals(shape):
-    """By position, place, rotation and growth: first and second derivatives of the distance, and `turn_slope`."""
+    """By position, place, rotation and growth: first
+    and second derivatives of the distance, and `turn_slope`.
+    """
     obstacles = (SHAPES[shape], SHAPES[shape].changed(axis=(1.0, 0.5, 0.1)))
     rng, shapes = np.random.default_rng(2), ObstacleSet(obstacles, D, CPU)
     y = rng.normal(size=(2, 40, 3)) * 0.025
@@ -84,25 +105,33 @@ def test_derivatives_of_distances_and_normals(shape):
 
 
 @pytest.mark.parametrize(
-    "mesh", [box_hexahedra((0.1, 0.03, 0.02), (3, 2, 2), nodes=n) for n in (8, 20, 27)] + [box_tetrahedra(order=2)]
+    "mesh",
+    [box_hexahedra((0.1, 0.03, 0.02), (3, 2, 2), nodes=n) for n in (8, 20, 27)]
+    + [box_tetrahedra(order=2)],
 )
 def test_areas_of_vertices_sum_to_the_surface(mesh):
     size, areas = np.ptp(mesh.vertices, axis=0), vertex_areas(mesh)
-    assert areas.sum() == pytest.approx(2.0 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0]))
+    assert areas.sum() == pytest.approx(
+        2.0 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
+    )
     assert areas.min() == 0.0
     inner = ((mesh.vertices > 1e-9) & (mesh.vertices < size - 1e-9)).all(1)
     assert np.all(areas[inner] == 0.0)
 
 
 def resting(tilt=0.0, moves=False, **options):
-    """A block at rest on a floor under gravity that is tilted by an angle [degrees], and its gap [m]."""
+    """A block at rest on a floor under gravity that is tilted
+    by an angle [degrees], and its gap [m].
+    """
     floor = resting_floor(WEIGHT * math.cos(math.radians(tilt)))
     return simulator(floor.changed(moves=moves), **options), -floor.position[2]
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
 def test_forces_of_contact_balance_a_block_that_sticks_or_slides(integrator):
-    """On inclines of half a degree less and more than arctan mu, the second of which begins beyond the slip speed."""
+    """On inclines of half a degree less and more than arctan mu,
+    the second of which begins beyond the slip speed.
+    """
     mu, h = vector([0.3], [0.3]), 5e-3
     radians = math.atan(0.3) + np.radians([-0.5, 0.5])
     gravity = torch.as_tensor(G * np.stack([np.sin(radians), 0.0 * radians, -np.cos(radians)], 1))
@@ -113,22 +142,29 @@ def test_forces_of_contact_balance_a_block_that_sticks_or_slides(integrator):
     for _ in range(30):
         states.append(s.step(states[-1], None, given))
     earlier, before, after = states[-3:]
-    old, new = (s.contacts(*pair, None, given)["obstacles"] for pair in ((earlier, before), (before, after)))
+    old, new = (
+        s.contacts(*pair, None, given)["obstacles"] for pair in ((earlier, before), (before, after))
+    )
     assert new.obstacles == ("obstacle",)
     weights = {"implicit_euler": (1.0, -1.0, 0.0), "bdf2": (1.5, -2.0, 0.5)}[integrator]
     v = [state.v for state in (after, before, earlier)]
     acceleration = sum(w * value for w, value in zip(weights, v, strict=True)) / h
     force = (s.prepare().mass[..., None] * (acceleration - gravity[:, None])).sum(1)
     acting = (new.normal + new.friction).sum((1, 2))
-    assert acting.numpy() == pytest.approx(force.numpy(), abs=1e-6 * float(force.norm(dim=-1).min()))
+    assert acting.numpy() == pytest.approx(
+        force.numpy(), abs=1e-6 * float(force.norm(dim=-1).min())
+    )
     pressed = old.normal.norm(dim=-1) > 0.0
     assert bool((new.normal[..., 2] >= 0.0).all())
-    # Coulomb's law with the normal force at the start of the step; the slide is that of the velocity at its end.
+    # Coulomb's law with the normal force at the start of the step; the slide is that of the
+    # velocity at its end.
     slide, at = after.v[:, new.vertices, None, :2], pressed[1]
     full = mu[1] * old.normal[1].norm(dim=-1)
     assert new.friction[1].norm(dim=-1).numpy() == pytest.approx(full.numpy(), rel=1e-6)
     assert new.friction[1, ..., :2][at].numpy() == pytest.approx(
-        (-full[..., None] * slide[1] / slide[1].norm(dim=-1, keepdim=True))[at].numpy(), rel=1e-6, abs=1e-9
+        (-full[..., None] * slide[1] / slide[1].norm(dim=-1, keepdim=True))[at].numpy(),
+        rel=1e-6,
+        abs=1e-9,
     )
     assert bool(((new.friction[..., :2] * slide).sum(-1)[pressed] < 0.0).all())
     assert new.slide.numpy() == pytest.approx(h / weights[0] * slide.norm(dim=-1).numpy(), rel=1e-6)
@@ -137,8 +173,13 @@ def test_forces_of_contact_balance_a_block_that_sticks_or_slides(integrator):
 
 
 def test_friction_of_a_region_of_the_body():
-    """Factors of 3 and 1: vertices within the region, beside it and between them have three, one and two times mu."""
-    halves = {"left": select_cells(BLOCK, x=(0.0, 0.01)), "top": select_cells(BLOCK, z=(0.01, SIDE))}
+    """Factors of 3 and 1: vertices within the region,
+    beside it and between them have three, one and two times mu.
+    """
+    halves = {
+        "left": select_cells(BLOCK, x=(0.0, 0.01)),
+        "top": select_cells(BLOCK, z=(0.01, SIDE)),
+    }
     mesh, x = replace(BLOCK, regions=halves), BLOCK.vertices[:, 0]
     factors = vertex_factors(mesh, {"left": 3.0})
     assert factors == pytest.approx(np.where(x < 0.009, 3.0, np.where(x > 0.011, 1.0, 2.0)))
@@ -154,16 +195,21 @@ def test_friction_of_a_region_of_the_body():
     normal, friction = old.normal[0, :, 0, 2].numpy(), new.friction[0, :, 0].norm(dim=-1).numpy()
     pressed = normal > 0.0
     assert pressed.sum() == 9
-    assert friction[pressed] == pytest.approx((mu * factors[new.vertices] * normal)[pressed], rel=1e-6)
+    assert friction[pressed] == pytest.approx(
+        (mu * factors[new.vertices] * normal)[pressed], rel=1e-6
+    )
     force = (s.prepare().mass[..., None] * (after.v - before.v) / 5e-3).sum(1)[0, 0]
-    assert float(force) == pytest.approx(-float(mu * (factors[new.vertices] * normal).sum()), rel=1e-6)
+    assert float(force) == pytest.approx(
+        -float(mu * (factors[new.vertices] * normal).sum()), rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("moves", [False, True])
 def test_a_batch_is_bit_for_bit_its_environments(moves):
     """In a groove, whose two sides approach by different ways."""
     sides = {
-        name: HalfSpace(position=(0.01, 0.0, -0.008), axis=(x, 0.0, 1.0), moves=moves) for name, x in GROOVE.items()
+        name: HalfSpace(position=(0.01, 0.0, -0.008), axis=(x, 0.0, 1.0), moves=moves)
+        for name, x in GROOVE.items()
     }
     s, steps = simulator(sides, 0.3), 12
     start = s.rest_state(4)
@@ -186,7 +232,9 @@ def test_a_floor_that_moves_carries_a_block():
     times = s.time_step * torch.arange(1, 61, dtype=torch.float64)[:, None, None]
     speed = 0.05
     carried = s.rollout(s.rest_state(), 60, Inputs(obstacle_move_x=speed * times)).v[-1, 0]
-    assert carried.numpy() == pytest.approx(np.broadcast_to([speed, 0.0, 0.0], carried.shape), abs=2e-5)
+    assert carried.numpy() == pytest.approx(
+        np.broadcast_to([speed, 0.0, 0.0], carried.shape), abs=2e-5
+    )
     rate = 1.0
     turned = s.rollout(s.rest_state(), 60, Inputs(obstacle_rotate_z=rate * times))
     bottom = torch.as_tensor(select_vertices(BLOCK, z=0.0))
@@ -203,7 +251,9 @@ def test_gradients_of_a_rollout_that_sticks_slides_and_rebounds(integrator, move
     options = {"slip_speed": slip, "integrator": integrator, "time_step": 1e-3, **TIGHT}
     s = simulator({"floor": floor, "ball": ball}, 0.0, material, **options)
     start, random = s.rest_state(3), torch.Generator().manual_seed(0)
-    values = {"v": start.v + vector([0.01, 0.0, -0.05], [0.4, 0.1, -0.1], [0.1, 0.0, -1.0])[:, None]}
+    values = {
+        "v": start.v + vector([0.01, 0.0, -0.05], [0.4, 0.1, -0.1], [0.1, 0.0, -1.0])[:, None]
+    }
     zeros = torch.zeros(3, 2, 3, dtype=torch.float64)
     values |= {"obstacle_": zeros, "obstacle_turn_": zeros}  # vectors have prefixes of x, y and z
     sizes = {"v": 1e-5, "contact_friction": 1e-5, "contact_stiffness": 0.5, "youngs_modulus": 25.0}
@@ -227,14 +277,20 @@ def test_gradients_of_a_rollout_that_sticks_slides_and_rebounds(integrator, move
                 given |= {f"{name}{axis}": value[..., k] for k, axis in enumerate("xyz")}
             elif name != "v":
                 given[name] = value
-        inputs = {name: given.pop(name).movedim(1, 0) for name in list(given) if "move" in name or "rotate" in name}
+        inputs = {
+            name: given.pop(name).movedim(1, 0)
+            for name in list(given)
+            if "move" in name or "rotate" in name
+        }
         return s.rollout(State(start.q, values["v"]), steps, Inputs(**inputs), given)
 
     weights = torch.randn(2, *start.q.shape, generator=random, dtype=torch.float64)
 
     def losses(values):
         trajectory = rollout(values)
-        return (weights[0] * trajectory.q[-1] + 0.02 * weights[1] * trajectory.v[-1]).flatten(1).sum(1)
+        return (
+            (weights[0] * trajectory.q[-1] + 0.02 * weights[1] * trajectory.v[-1]).flatten(1).sum(1)
+        )
 
     if not moves:
         t = rollout(values)
@@ -258,7 +314,11 @@ def leaning(mu=0.0, **options):
 def test_a_beam_that_leans_on_a_sphere_is_where_it_comes_to_rest():
     s = leaning()
     leant = s.static_equilibrium().q
-    free = Simulator(Body(BEAM, fixed=s.body.fixed), s.material, gravity=s.gravity).static_equilibrium().q
+    free = (
+        Simulator(Body(BEAM, fixed=s.body.fixed), s.material, gravity=s.gravity)
+        .static_equilibrium()
+        .q
+    )
     assert float((leant - free)[..., 2].max()) > 5e-4  # which is held up
     rest = leaning(time_step=0.02).rollout(s.rest_state(), 150).q[-1]
     assert leant.numpy() == pytest.approx(rest.numpy(), abs=1e-9)
@@ -269,7 +329,10 @@ def test_gradients_of_a_leaning_beam_with_friction():
     s = leaning(0.5)
     push = torch.zeros(2, s.body.n_vertices, 3, dtype=torch.float64)
     push[:, select_vertices(BEAM, x=0.08), 1] = vector([2e-3], [1e-2])
-    values = {"contact_friction": vector([0.5], [0.3]), "contact_stiffness": KAPPA * vector([1.0], [0.7])}
+    values = {
+        "contact_friction": vector([0.5], [0.3]),
+        "contact_stiffness": KAPPA * vector([1.0], [0.7]),
+    }
     values |= {"youngs_modulus": 4e4 * vector([1.0], [1.1])}
     places = {"push": push, "shift": torch.zeros(2, 1, 3, dtype=torch.float64)}
     weights = noise(*push.shape)
@@ -284,12 +347,20 @@ def test_gradients_of_a_leaning_beam_with_friction():
     both = solve(values), solve({**values, "contact_friction": 0.0})
     aside = [(q - before.q)[..., 1].abs().amax(1).detach() for before, q in both]
     assert bool((aside[0] < 0.9 * aside[1]).all())
-    sizes = {"push": 1e-5, "shift": 1e-7, "contact_friction": 1e-4, "contact_stiffness": 5.0, "youngs_modulus": 1.0}
+    sizes = {
+        "push": 1e-5,
+        "shift": 1e-7,
+        "contact_friction": 1e-4,
+        "contact_stiffness": 5.0,
+        "youngs_modulus": 1.0,
+    }
     check_slopes(lambda values: (weights * solve(values)[1]).flatten(1).sum(1), values, sizes)
 
 
 def test_a_free_block_rests_on_a_floor_by_friction():
-    """It carries its weight, and goes aside by less than the slip under which friction holds a push."""
+    """It carries its weight, and goes aside by less than the slip under
+    which friction holds a push.
+    """
     s = simulator({"floor": resting_floor(WEIGHT)}, 0.5, **TIGHT)
     push = torch.zeros(1, s.body.n_vertices, 3, dtype=torch.float64)
     push[..., 0] = 0.3 * WEIGHT / s.body.n_vertices
@@ -306,27 +377,45 @@ def test_a_free_block_rests_on_a_floor_by_friction():
 def test_a_free_block_that_no_friction_holds_is_refused(mu, gap):
     s = simulator({"floor": HalfSpace(position=(0.0, 0.0, -gap))}, mu)
     assert not s.is_held(s.rest_state())
-    refuses(InputError, "lay it on an obstacle with friction, within the distance of contact", s.static_equilibrium)
+    refuses(
+        InputError,
+        "lay it on an obstacle with friction, within the distance of contact",
+        s.static_equilibrium,
+    )
 
 
 def test_bodies_states_and_inputs_that_contact_refuses():
     with pytest.raises(InputError, match=r"within the obstacle 'floor' at rest: vertex 0 by 2 mm"):
         simulator(
-            {"ball": Sphere(radius=0.01, position=(0.1, 0.0, 0.0)), "floor": HalfSpace(position=(0.0, 0.0, 2e-3))}
+            {
+                "ball": Sphere(radius=0.01, position=(0.1, 0.0, 0.0)),
+                "floor": HalfSpace(position=(0.0, 0.0, 2e-3)),
+            }
         )
     s = simulator(HalfSpace(position=(0.0, 0.0, -1e-3), moves=True))
     start = s.rest_state()
-    with pytest.raises(InputError, match=r"'obstacle' at the start of a step: vertex \d+ by 1.5 mm"):
+    with pytest.raises(
+        InputError, match=r"'obstacle' at the start of a step: vertex \d+ by 1.5 mm"
+    ):
         s.step(State(start.q - vector(0.0, 0.0, 2.5e-3), start.v))
     held = simulator(s.body.energies[0].obstacles["obstacle"], fixed=select_vertices(BLOCK, z=0.0))
-    with pytest.raises(InputError, match=r"after an obstacle has moved: vertex \d+ by 0.5 mm; .* move obstacles less"):
+    with pytest.raises(
+        InputError,
+        match=r"after an obstacle has moved: vertex \d+ by 0.5 mm; .* move obstacles less",
+    ):
         held.rollout(start, 2, Inputs(obstacle_move_z=vector(0.0, 1.5e-3)[:, None, None]))
-    floor, other = HalfSpace(position=(0.0, 0.0, -0.01), moves=True), HalfSpace(position=(0.0, 0.0, -0.02))
-    half = Body(BLOCK, symmetry=[SymmetryPlane((1.0, 0.0, 0.0))], energies=[Contact({"floor": other})])
+    floor = HalfSpace(position=(0.0, 0.0, -0.01), moves=True)
+    other = HalfSpace(position=(0.0, 0.0, -0.02))
+    half = Body(
+        BLOCK, symmetry=[SymmetryPlane((1.0, 0.0, 0.0))], energies=[Contact({"floor": other})]
+    )
     refuses(InputError, "symmetry planes has no contact", Simulator, half)
     lying = Simulator(Body(BLOCK, energies=[Contact({"floor": floor, "other": other})]))
     with pytest.raises(InputError, match="without moves=True"):
-        lying.step(lying.rest_state(), Inputs(obstacle_move_z=torch.tensor([[0.0, 1e-3]], dtype=torch.float64)))
+        lying.step(
+            lying.rest_state(),
+            Inputs(obstacle_move_z=torch.tensor([[0.0, 1e-3]], dtype=torch.float64)),
+        )
 
 
 TWO = {"a": HalfSpace(position=(0.0, 0.0, -0.1)), "b": HalfSpace(position=(0.0, 0.0, -0.2))}
@@ -343,20 +432,32 @@ def test_values_by_the_name_of_an_obstacle():
     ("make", "message"),
     [
         (lambda: Contact({}), "needs an obstacle"),
-        (lambda: Contact({"a": {"shape": "sphere"}}), "the obstacle a is of type dict: give one, such as HalfSpace"),
+        (
+            lambda: Contact({"a": {"shape": "sphere"}}),
+            "the obstacle a is of type dict: give one, such as HalfSpace",
+        ),
         (lambda: Contact({"a": HalfSpace()}, friction=-0.1), "contact_friction.* -0.1"),
         (lambda: Contact({"a": HalfSpace()}, stiffness=0.0), "contact_stiffness.* 0"),
-        (lambda: Contact({"a": HalfSpace()}, friction=[0.1, 0.2]), "contact_friction has 2 values for 1 obstacle"),
+        (
+            lambda: Contact({"a": HalfSpace()}, friction=[0.1, 0.2]),
+            "contact_friction has 2 values for 1 obstacle",
+        ),
         (
             lambda: Contact(TWO, friction={"a": 0.1, "c": 0.2}),
             "friction has values for 'a', 'c', but the obstacles are",
         ),
         (lambda: Contact({"a": HalfSpace()}, slip_speed=math.nan), "contact.slip_speed is nan"),
-        (lambda: Contact({"a": HalfSpace()}, friction_factors={"foot": -1.0}), "friction_factors.foot is -1"),
+        (
+            lambda: Contact({"a": HalfSpace()}, friction_factors={"foot": -1.0}),
+            "friction_factors.foot is -1",
+        ),
         (lambda: Sphere(radius=-1.0), "Sphere.radius is -1.0: it must be a positive number, in m"),
         (lambda: Box(edges=(0.1, 0.0, 0.1)), "Box.edges is"),
         (lambda: HalfSpace(axis=(0.0, 0.0, 0.0)), "HalfSpace.axis is .* not all zero"),
-        (lambda: HalfSpace(position=(0.0, 0.0)), r"HalfSpace.position is \(0.0, 0.0\): it must be three numbers, in m"),
+        (
+            lambda: HalfSpace(position=(0.0, 0.0)),
+            r"HalfSpace.position is \(0.0, 0.0\): it must be three numbers, in m",
+        ),
     ],
 )
 def test_values_out_of_range(make, message):
@@ -366,7 +467,9 @@ def test_values_out_of_range(make, message):
 def test_an_obstacle_and_a_clamp_that_pass_through_one_another_in_a_step_are_refused():
     thickness = 0.002
     plate = Box(position=(0.01, 0.01, SIDE + 0.01), edges=(0.05, 0.05, thickness), moves=True)
-    simulator = Simulator(Body(BLOCK, energies=[Contact({"plate": plate})]), gravity=(0.0, 0.0, 0.0), time_step=0.01)
+    simulator = Simulator(
+        Body(BLOCK, energies=[Contact({"plate": plate})]), gravity=(0.0, 0.0, 0.0), time_step=0.01
+    )
     still = torch.zeros(1, 1, dtype=torch.float64)
     state = simulator.step(simulator.rest_state(), Inputs(obstacle_move_z=still))
     for way in np.linspace(0.012 + 0.5 * thickness, 0.1, 3):
@@ -383,4 +486,6 @@ def test_an_obstacle_and_a_clamp_that_pass_through_one_another_in_a_step_are_ref
         inputs = Inputs(fixed_positions=clamp - torch.tensor([0.0, 0.0, way]))
         refuses(InputError, "'plate'", simulator.step, simulator.rest_state(), inputs)
         refuses(InputError, "'plate'", simulator.static_equilibrium, inputs)
-    simulator.step(simulator.rest_state(), Inputs(fixed_positions=clamp - torch.tensor([0.0, 0.0, 0.0015])))
+    simulator.step(
+        simulator.rest_state(), Inputs(fixed_positions=clamp - torch.tensor([0.0, 0.0, 0.0015]))
+    )

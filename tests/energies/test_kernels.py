@@ -1,6 +1,8 @@
-"""Local step of a solid against an independent NumPy implementation, by a tetrahedron with one F an environment.
+"""Local step of a solid against an independent NumPy implementation,
+by a tetrahedron with one F an environment.
 
-Cells that vector instructions take as a whole (`kernels.lanes`) are compared with the same points one by one.
+Cells that vector instructions take as a whole (`kernels.lanes`) are compared with the same points
+one by one.
 """
 
 import numpy as np
@@ -50,9 +52,16 @@ def potential_of(body, model, batch, device="cpu"):
 
 
 def unit_potential(
-    gradients, model="corotated", shape=SHAPE, volume=VOLUME, viscosity=(0.0, 0.0), reference=None, **where
+    gradients,
+    model="corotated",
+    shape=SHAPE,
+    volume=VOLUME,
+    viscosity=(0.0, 0.0),
+    reference=None,
+    **where,
 ):
-    """Potential of the unit tetrahedron, whose residual on vertices 1 to 3 is V times the stress's columns.
+    """Potential of the unit tetrahedron, whose residual
+    on vertices 1 to 3 is V times the stress's columns.
 
     `viscosity` is that of shape and that of volume, `reference` the strain from which both act.
     """
@@ -64,9 +73,14 @@ def unit_potential(
         return torch.full((count, *size), float(value), **where)
 
     viscous = torch.as_tensor(viscosity, **where).expand(count, 2)
-    strain = torch.as_tensor(np.zeros((count, 3, 3)) if reference is None else reference, **where)[:, None]
+    strain = torch.as_tensor(np.zeros((count, 3, 3)) if reference is None else reference, **where)
+    strain = strain[:, None]
     sizes = {"shape": shape, "volume": volume}
-    moduli = [0.5 * shape, 0.0, volume] if "hookean" in model else [sizes[rule] for rule in MATERIALS[model].rules]
+    moduli = (
+        [0.5 * shape, 0.0, volume]
+        if "hookean" in model
+        else [sizes[rule] for rule in MATERIALS[model].rules]
+    )
     stiffness = torch.stack([full(modulus, 1) for modulus in moduli], dim=-1)
     values = {"stiffness": stiffness, "viscosity": viscous, "strain_offset": viscous[0, 0] * strain}
     values["dilation_offset"] = viscous[0, 1] * strain.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -97,7 +111,10 @@ def reference_unimodular(f):
         return ((d - s) ** 2).sum(), np.array([slope[0] - slope[2], slope[1] - slope[2]])
 
     starts = [(a, b) for a in (-0.7, 0.0, 0.7) for b in (-0.7, 0.0, 0.7)]
-    results = [scipy.optimize.minimize(distance, start, jac=True, options={"gtol": 1e-12}) for start in starts]
+    results = [
+        scipy.optimize.minimize(distance, start, jac=True, options={"gtol": 1e-12})
+        for start in starts
+    ]
     best = min(results, key=lambda result: result.fun).x
     return u * np.exp([best[0], best[1], -best.sum()]) @ vt
 
@@ -105,7 +122,9 @@ def reference_unimodular(f):
 def reference_energy(f, model):
     if model == "corotated":
         _, s, _ = signed_svd(f)
-        return SHAPE * ((s - 1) ** 2).sum() + VOLUME / 2 * ((f - reference_unimodular(f)) ** 2).sum()
+        return (
+            SHAPE * ((s - 1) ** 2).sum() + VOLUME / 2 * ((f - reference_unimodular(f)) ** 2).sum()
+        )
     j = np.linalg.det(f)
     if model == "mooney_rivlin":  # with c10 = c01
         first = (f**2).sum() - 3 - 2 * (j - 1) + (j - 1) ** 2
@@ -117,7 +136,9 @@ def reference_energy(f, model):
 @pytest.mark.parametrize("model", MATERIALS)
 def test_energies_equal_the_closed_form(model, device):
     _, energy = stress_and_energy(GRADIENTS, model, device=torch.device(device))
-    np.testing.assert_allclose(energy, [reference_energy(f, model) for f in GRADIENTS], rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(
+        energy, [reference_energy(f, model) for f in GRADIENTS], rtol=1e-9, atol=1e-14
+    )
 
 
 def viscous_energy(f, reference, viscosity, lame_factor):
@@ -130,7 +151,9 @@ def viscous_energy(f, reference, viscosity, lame_factor):
     return potential((f.transpose(0, 2, 1) @ f - np.eye(3)) / 2 - reference) - potential(-reference)
 
 
-@pytest.mark.parametrize(("model", "lame_factor"), [("corotated", 1 / 3), ("stable_neo_hookean", 1.0)])
+@pytest.mark.parametrize(
+    ("model", "lame_factor"), [("corotated", 1 / 3), ("stable_neo_hookean", 1.0)]
+)
 def test_viscous_stress_is_the_derivative_of_the_dissipation_potential(model, lame_factor):
     rng = np.random.default_rng(2)
     noise = rng.normal(scale=0.1, size=GRADIENTS.shape)
@@ -138,7 +161,9 @@ def test_viscous_stress_is_the_derivative_of_the_dissipation_potential(model, la
     stress, energy = stress_and_energy(GRADIENTS, model, **viscous)
     elastic_stress, elastic_energy = stress_and_energy(GRADIENTS, model)
     arguments = (viscous["reference"], viscous["viscosity"], lame_factor)
-    np.testing.assert_allclose(energy - elastic_energy, viscous_energy(GRADIENTS, *arguments), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        energy - elastic_energy, viscous_energy(GRADIENTS, *arguments), rtol=1e-9, atol=1e-12
+    )
     step, direction = 1e-5, rng.normal(size=GRADIENTS.shape)
     ahead, behind = (viscous_energy(GRADIENTS + s * step * direction, *arguments) for s in (1, -1))
     slope = np.einsum("nij,nij->n", stress - elastic_stress, direction)
@@ -156,12 +181,15 @@ def dense_tangent(potential, positive=None):
 
 
 def test_clamped_viscous_tangent_is_positive_semidefinite_and_collapsed_elements_stay_finite():
-    reference = np.tile(0.5 * np.eye(3), (len(GRADIENTS), 1, 1))  # compression rate: a negative geometric part
+    # Compression rate: a negative geometric part.
+    reference = np.tile(0.5 * np.eye(3), (len(GRADIENTS), 1, 1))
     potential = unit_potential(GRADIENTS, viscosity=(5.0, 5.0), reference=reference)
     everywhere = torch.ones(potential.batch, dtype=torch.bool)
     assert np.linalg.eigvalsh(dense_tangent(potential)).min() < -1.0
     assert np.linalg.eigvalsh(dense_tangent(potential, everywhere)).min() > -1e-9
-    collapsed = np.stack([np.zeros((3, 3)), np.diag([1.0, 0, 0]), -np.eye(3), np.diag([1e3, 1e-3, -5])])
+    collapsed = np.stack(
+        [np.zeros((3, 3)), np.diag([1.0, 0, 0]), -np.eye(3), np.diag([1e3, 1e-3, -5])]
+    )
     for model in MATERIALS:
         stress, energy = stress_and_energy(collapsed, model)
         assert np.isfinite(stress).all()
@@ -185,7 +213,9 @@ MESHES = {
 
 
 def loaded_potential(mesh):
-    """Two environments of a deformed, damped body with inertia, its pattern, and its free degrees of freedom."""
+    """Two environments of a deformed, damped body with inertia,
+    its pattern, and its free degrees of freedom.
+    """
     body = clamped(mesh)
     b, n = 2, body.n_vertices
     generator = torch.Generator().manual_seed(0)
@@ -201,7 +231,11 @@ def loaded_potential(mesh):
         stiffness.append(torch.as_tensor(carried) * (1.0 + noise(b, 1)) * scale)
     strain = 0.01 * noise(b, sum(s.n_points for s in sets), 3, 3)
     main = noise(b, n, 3), 1e4 * (1 + noise(b, n)), noise(b, n, 3)
-    values = {"viscosity": noise(b, 2), "strain_offset": strain + strain.mT, "dilation_offset": strain[..., 0, 0]}
+    values = {
+        "viscosity": noise(b, 2),
+        "strain_offset": strain + strain.mT,
+        "dilation_offset": strain[..., 0, 0],
+    }
     potential.set_terms(StepTerms(*main, [{"stiffness": torch.stack(stiffness, dim=-1), **values}]))
     potential.positions.copy_(torch.as_tensor(mesh.vertices) + 1e-3 * noise(b, n, 3))
     pattern = BlockPattern(body.mesh.vertices, body.fixed_vertices, sets)
@@ -225,11 +259,20 @@ def test_assembled_hessian_is_the_derivative_of_the_residual_in_every_layout(kin
         differences[:, :, column] = (moved[0] - moved[1]) / (2 * step)
     potential.positions.copy_(start)
     potential.update_tangent()
-    right = torch.randn(2, len(dofs), 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    right = torch.randn(
+        2, len(dofs), 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
     scale = np.abs(differences).max()
     solutions = []
     for layout in ("dense", "banded", "sparse"):
-        arguments = (pattern.rows, pattern.cols, len(pattern.free), 3, potential.device, torch.float64)
+        arguments = (
+            pattern.rows,
+            pattern.cols,
+            len(pattern.free),
+            3,
+            potential.device,
+            torch.float64,
+        )
         solver = make_linear_solver(layout, *arguments)
         values = HessianAssembly(potential, solver, pattern)()
         if layout == "dense":
@@ -260,7 +303,10 @@ def positions(mesh):
     edge = np.ptp(mesh.vertices[mesh.cells[0]], axis=0).min()
     turned = [Rotation.random(random_state=n).apply(q) for n in range(len(STRAINS))]
     return np.stack(
-        [x + strain * edge * random.uniform(-0.5, 0.5, q.shape) for x, strain in zip(turned, STRAINS, strict=True)]
+        [
+            x + strain * edge * random.uniform(-0.5, 0.5, q.shape)
+            for x, strain in zip(turned, STRAINS, strict=True)
+        ]
     )
 
 
@@ -270,7 +316,9 @@ def whole_cells(p):
 
 
 def evaluated(mesh, viscosity, q):
-    """A potential after an evaluation and a tangent, of which the second environment has clamped eigenvalues."""
+    """A potential after an evaluation and a tangent,
+    of which the second environment has clamped eigenvalues.
+    """
     batch = len(q)
     p = potential_of(Body(mesh), "corotated", batch)
     random = torch.Generator().manual_seed(0)
@@ -278,10 +326,12 @@ def evaluated(mesh, viscosity, q):
     carried = torch.as_tensor(term._carried / term._carried.max())
     offset = 0.1 * torch.randn(batch, term.n_points, 3, 3, generator=random, dtype=torch.float64)
     values = {
-        "stiffness": carried * (1.0 + torch.rand(batch, term.n_points, 2, generator=random, dtype=torch.float64)),
+        "stiffness": carried
+        * (1.0 + torch.rand(batch, term.n_points, 2, generator=random, dtype=torch.float64)),
         "viscosity": torch.tensor([viscosity]).double().expand(batch, 2),
         "strain_offset": viscosity[0] * (offset + offset.mT),
-        "dilation_offset": 0.1 * torch.randn(batch, term.n_points, generator=random, dtype=torch.float64),
+        "dilation_offset": 0.1
+        * torch.randn(batch, term.n_points, generator=random, dtype=torch.float64),
     }
     n = len(mesh.vertices)
     p.set_terms(StepTerms(p.zeros(n, 3), p.zeros(n), p.zeros(n, 3), [values]))
@@ -324,7 +374,9 @@ def test_cells_as_a_whole_equal_their_points(mesh, viscosity, monkeypatch):
 
 @pytest.mark.parametrize("flattest", [0.19, 0.21])
 def test_a_flat_point_leaves_the_others_of_its_cell_as_they_are(flattest, monkeypatch):
-    """One corner of a cell of 27 nodes is pushed in until the flattest point has a given J: some groups are taken."""
+    """One corner of a cell of 27 nodes is pushed in until the flattest point has a given J:
+    some groups are taken.
+    """
     mesh = box_hexahedra(BAR, (1, 1, 1), nodes=27)
     p, way = potential_of(Body(mesh), "corotated", 1), np.zeros_like(mesh.vertices)
     way[7] = -mesh.vertices[7]  # the corner opposite to the origin
@@ -358,5 +410,8 @@ def test_an_environment_that_is_done_keeps_its_sums_and_its_tangent():
 
 
 def test_cells_whose_points_have_both_terms_or_none_to_share_are_not_taken():
-    for body in (Body(CELLS["8 nodes"], volume_integration="full"), Body(box_tetrahedra(BAR, (3, 1, 1)))):
+    for body in (
+        Body(CELLS["8 nodes"], volume_integration="full"),
+        Body(box_tetrahedra(BAR, (3, 1, 1))),
+    ):
         assert not any(whole_cells(potential_of(body, "corotated", 1)))

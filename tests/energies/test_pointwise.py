@@ -1,4 +1,6 @@
-"""Energies that are one Warp function, against hand-written kernels, eigenvalues and differences."""
+"""Energies that are one Warp function, against hand-written kernels,
+eigenvalues and differences.
+"""
 
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -9,7 +11,15 @@ import torch
 import warp as wp
 
 from support.clamped import clamped, noise
-from warp_resphys import Corotated, Inputs, Muscles, Simulator, SolverSettings, box_hexahedra, select_vertices
+from warp_resphys import (
+    Corotated,
+    Inputs,
+    Muscles,
+    Simulator,
+    SolverSettings,
+    box_hexahedra,
+    select_vertices,
+)
 from warp_resphys.energies import Muscle
 from warp_resphys.energies.pointwise import PointwiseEnergy, at_vertices, between
 from warp_resphys.io.errors import InputError
@@ -89,7 +99,9 @@ def simulator(energy):
 
 
 def acting():
-    return Inputs(**{name: torch.full((2, 1), value, dtype=torch.float64) for name, value in VALUES.items()})
+    return Inputs(
+        **{name: torch.full((2, 1), value, dtype=torch.float64) for name, value in VALUES.items()}
+    )
 
 
 @pytest.mark.parametrize("at", ["rest", "bent"])
@@ -97,8 +109,11 @@ def test_stress_tangent_and_adjoint_equal_hand_written_kernels(at):
     results = []
     for energy in (FIBRES, Fibre()):
         s = simulator(energy)
-        state, stiffness = pose(s, at, 2), torch.full((2, 1), 4e4, dtype=torch.float64, requires_grad=True)
-        inputs = Inputs(**{name: value.requires_grad_() for name, value in acting().actuation.items()})
+        state = pose(s, at, 2)
+        stiffness = torch.full((2, 1), 4e4, dtype=torch.float64, requires_grad=True)
+        inputs = Inputs(
+            **{name: value.requires_grad_() for name, value in acting().actuation.items()}
+        )
         here = s.linearise(state, acting())
         x = state.q + 1e-3 * noise(*state.q.shape)
         residual = here.residual(x)
@@ -106,13 +121,22 @@ def test_stress_tangent_and_adjoint_equal_hand_written_kernels(at):
         product = here.product(torch.sin(50.0 * x))
         end = s.step(state, inputs, {"muscle_stiffness": stiffness})
         leaves = [*inputs.actuation.values(), stiffness]
-        results.append([residual, product, *torch.autograd.grad((end.q**2).sum() + end.q[..., 2].sum(), leaves)])
+        results.append(
+            [
+                residual,
+                product,
+                *torch.autograd.grad((end.q**2).sum() + end.q[..., 2].sum(), leaves),
+            ]
+        )
     for one, other in zip(*results, strict=True):
         torch.testing.assert_close(one, other, rtol=2e-9, atol=1e-9 * float(other.abs().max()))
 
 
 def test_a_clamped_tangent_has_no_negative_eigenvalue():
-    """Springs that push have a negative stiffness across; the clamped one is what is left without it."""
+    """Springs that push have a negative stiffness across.
+
+    The clamped one is what is left without it.
+    """
     s = simulator(Spring(length=0.2))
     s.linearise(s.rest_state(2))
     p = s.workspace(2).potential
@@ -123,7 +147,9 @@ def test_a_clamped_tangent_has_no_negative_eigenvalue():
     values, vectors = torch.linalg.eigh(exact[0, :, 0])
     assert float(values.min()) < -1.0
     expected = vectors @ torch.diag_embed(values.clamp_min(0.0)) @ vectors.mT
-    torch.testing.assert_close(p.tangents[-1][0, :, 0], expected, rtol=0.0, atol=1e-9 * float(values.max()))
+    torch.testing.assert_close(
+        p.tangents[-1][0, :, 0], expected, rtol=0.0, atol=1e-9 * float(values.max())
+    )
     torch.testing.assert_close(p.tangents[-1][1], exact[1])
 
 
@@ -134,7 +160,10 @@ def test_a_parameter_may_be_an_array():
         end = s.rollout(s.rest_state(2), 2, parameters={"coefficients": coefficients}).q[-1]
         return 1e3 * (end[0] * weights).sum() + 2e3 * (end[1] * weights).sum()
 
-    for values in (torch.tensor([0.1, 2.0, 30.0]), torch.tensor([[0.1, 2.0, 30.0], [0.3, 1.0, -20.0]])):
+    for values in (
+        torch.tensor([0.1, 2.0, 30.0]),
+        torch.tensor([[0.1, 2.0, 30.0], [0.3, 1.0, -20.0]]),
+    ):
         given = values.double().requires_grad_()
         (gradient,) = torch.autograd.grad(loss(given), given)
         assert gradient.shape == given.shape

@@ -74,26 +74,36 @@ def test_gradients_of_every_parameter_under_pressure(start, poissons_ratio, opti
 
 
 @pytest.mark.parametrize(
-    ("kind", "taut"), [("hexahedron", False), pytest.param("tetrahedron10", True, marks=pytest.mark.slow)]
+    ("kind", "taut"),
+    [("hexahedron", False), pytest.param("tetrahedron10", True, marks=pytest.mark.slow)],
 )
 def test_gradients_with_fibres(kind, taut):
-    """Where all fibres are taut; and where some are not, or are about to be: shorter steps pass over fewer of these."""
+    """Where all fibres are taut.
+
+    And where some are not, or are about to be: shorter steps pass over fewer of these.
+    """
     s = simulator(kind, SOFT, {"angles": (20.0, -20.0)}, time_step=1e-3)
     start = s.rest_state(1).q * s.tensor([1.1, 1.1, 1.1] if taut else [1.0, 1.0, 1.0])
     values = {"pressure": s.tensor([[2e4, 1e4]]), "stiffness": s.tensor([2e3, 1e3]), "q": start}
     weights = noise(*start.shape)
 
     def loss(given):
-        inputs, parameters = Inputs(pressure=given["pressure"]), {"fibre_stiffness": given["stiffness"]}
+        inputs = Inputs(pressure=given["pressure"])
+        parameters = {"fibre_stiffness": given["stiffness"]}
         end = s.rollout(State(given["q"], 0.0 * start), 3, inputs, parameters)
         return (weights * end.q[-1]).sum()
 
-    check_slopes(loss, values, {name: 2e-5 * float(value.abs().mean()) for name, value in values.items()})
+    check_slopes(
+        loss, values, {name: 2e-5 * float(value.abs().mean()) for name, value in values.items()}
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_fibres_run_around_the_chamber_and_spare_its_ends(kind):
-    """Stretching the chamber across itself stretches its fibres as much; along itself it does nothing to them."""
+    """Stretching the chamber across itself stretches its fibres as much.
+
+    Along itself it does nothing to them.
+    """
     mesh = hollow_box(kind)
     (points,) = Fibres(find_chambers(mesh, (1.0, 0.0, 0.0))[:1]).points(mesh)
     sides = 2 * (0.01 + 0.02 / 3) * 0.02  # the chamber reaches 2 cm along x
@@ -107,7 +117,10 @@ def test_fibres_run_around_the_chamber_and_spare_its_ends(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_fibres_around_the_outside_are_in_its_sides_alone(kind):
-    """Neither in the faces at its ends nor in those of the chambers; a stretch along the body does not stretch them."""
+    """Neither in the faces at its ends nor in those of the chambers.
+
+    A stretch along the body does not stretch them.
+    """
     mesh = hollow_box(kind)
     (points,) = Fibres([outer_surface(mesh, (1.0, 0.0, 0.0))], axis=(1.0, 0.0, 0.0)).points(mesh)
     size = np.ptp(mesh.vertices, axis=0)
@@ -123,7 +136,9 @@ def test_fibres_hold_a_chamber_from_growing_wide_and_do_not_push():
     pressure = torch.tensor([[2e4, 2e4]], dtype=torch.float64)
     widths = {}
     for stiffness in (0.0, 1e3, 1e5):
-        s = simulator(material=Corotated(50e3, 0.45), fibres={"stiffness": stiffness}, gravity=(0.0, 0.0, 0.0))
+        s = simulator(
+            material=Corotated(50e3, 0.45), fibres={"stiffness": stiffness}, gravity=(0.0, 0.0, 0.0)
+        )
         for sign in (1.0, -1.0):
             q = s.static_equilibrium(Inputs(pressure=sign * pressure)).q
             widths[stiffness, sign] = float(volumes_of(s, q)[0, 0] / (2 * BRICK) - 1.0)
@@ -137,7 +152,9 @@ def test_bad_input():
     chamber = find_chambers(mesh, (1.0, 0.0, 0.0))[0]
     hole = clamped(mesh, energies=[Pressure([Chamber("lid", chamber.faces[1:])])])
     refuses(MeshError, "lid has 4 open edges that can move, .*: close the surface", Simulator, hole)
-    with pytest.raises(MeshError, match="the faces of turned look into the solid, or it is the outer surface"):
+    with pytest.raises(
+        MeshError, match="the faces of turned look into the solid, or it is the outer surface"
+    ):
         check_chambers([Chamber("turned", chamber.faces[:, ::-1])], mesh)
     with pytest.raises(MeshError, match="again and first share a face"):
         check_chambers([Chamber("first", chamber.faces), Chamber("again", chamber.faces)], mesh)
@@ -150,11 +167,15 @@ def test_bad_input():
         simulator(fibres={"stiffness": [1.0, 2.0, 3.0]}).prepare()
     refuses(InputError, "fibre_stiffness is", Fibres, [chamber], stiffness=-1.0)
     s, zeros = simulator(), torch.zeros(1, 3, dtype=torch.float64)
-    refuses(InputError, r"pressure has shape \(1, 3\)", s.step, s.rest_state(), Inputs(pressure=zeros))
+    refuses(
+        InputError, r"pressure has shape \(1, 3\)", s.step, s.rest_state(), Inputs(pressure=zeros)
+    )
     with pytest.raises(InputError, match=r"Unknown input tension\. This body accepts .*pressure"):
         s.step(s.rest_state(), Inputs(tension=zeros))
     with pytest.raises(InputError, match="environment 0, chamber 1"):
-        s.step(s.rest_state(), Inputs(pressure=torch.tensor([[0.0, torch.nan]], dtype=torch.float64)))
+        s.step(
+            s.rest_state(), Inputs(pressure=torch.tensor([[0.0, torch.nan]], dtype=torch.float64))
+        )
     bare = Simulator(Body(mesh))
     with pytest.raises(InputError, match=r"Unknown input .*This body accepts external_force"):
         bare.step(bare.rest_state(), Inputs(pressure=zeros))

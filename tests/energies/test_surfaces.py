@@ -1,4 +1,6 @@
-"""Contact of bodies with one another and with themselves: pairs, barrier, friction, gradients, batches, refusals."""
+"""Contact of bodies with one another and with themselves:
+pairs, barrier, friction, gradients, batches, refusals.
+"""
 
 import math
 from dataclasses import replace
@@ -11,7 +13,16 @@ import warp as wp
 from support.clamped import clamped
 from support.refusals import refuses
 from support.slopes import check_slopes
-from warp_resphys import Corotated, Inputs, Scene, Simulator, SolverSettings, State, SurfaceContact, SymmetryPlane
+from warp_resphys import (
+    Corotated,
+    Inputs,
+    Scene,
+    Simulator,
+    SolverSettings,
+    State,
+    SurfaceContact,
+    SymmetryPlane,
+)
 from warp_resphys.energies import FrictionPair
 from warp_resphys.energies.contact.pairs import PairList, Surface
 from warp_resphys.energies.launcher import Launcher, warp_view
@@ -36,7 +47,9 @@ KAPPA, D, G = 1e5, 1e-3, 9.81
 def turned(mesh, angles, place):
     """A mesh turned about its middle by angles about x and z, with its middle at a place."""
     (cx, cz), (sx, sz) = np.cos(angles), np.sin(angles)
-    turn = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    turn = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]]) @ np.array(
+        [[1, 0, 0], [0, cx, -sx], [0, sx, cx]]
+    )
     middle = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
     return replace(mesh, vertices=(mesh.vertices - middle) @ turn.T + place)
 
@@ -62,22 +75,32 @@ def launched(kernel, launcher, chosen, pairs, x, stiffness, reach, *out):
 
 def pair_forces(launcher, pairs, x, stiffness, reach):
     """Energies (C,) and gradients (C, 4, 3) of pairs."""
-    force, energy = torch.zeros(len(x), 4, 3, dtype=torch.float64), torch.zeros(len(x), dtype=torch.float64)
-    out = (force, nearest_points.Corners), (energy, wp.float64), (torch.zeros(len(x), dtype=torch.int32), wp.int32)
+    force = torch.zeros(len(x), 4, 3, dtype=torch.float64)
+    energy = torch.zeros(len(x), dtype=torch.float64)
+    out = (
+        (force, nearest_points.Corners),
+        (energy, wp.float64),
+        (torch.zeros(len(x), dtype=torch.int32), wp.int32),
+    )
     launched(kernels.pair_forces, launcher, launcher.active, pairs, x, stiffness, reach, *out)
     return energy.numpy(), force.numpy()
 
 
 def pair_tangents(launcher, pairs, x, stiffness, reach):
     """Second derivatives (C, 12, 12) of the energies of pairs."""
-    hessian, chosen = torch.zeros(len(x), 12, 12, dtype=torch.float64), torch.arange(len(x), dtype=torch.int32)
-    launched(kernels.pair_tangents, launcher, chosen, pairs, x, stiffness, reach, (hessian, wp.float64))
+    hessian = torch.zeros(len(x), 12, 12, dtype=torch.float64)
+    chosen = torch.arange(len(x), dtype=torch.int32)
+    launched(
+        kernels.pair_tangents, launcher, chosen, pairs, x, stiffness, reach, (hessian, wp.float64)
+    )
     return hessian.numpy()
 
 
 @pytest.mark.parametrize("kind", [0, 1])
 def test_derivatives_of_pairs(kind):
-    """Vertex and triangle, and edges, also almost parallel ones, at random: gradient and Hessian are differences."""
+    """Vertex and triangle, and edges, also almost parallel ones, at random:
+    gradient and Hessian are differences.
+    """
     random, count, reach = np.random.default_rng(kind), 400, 1.5
     x = random.normal(size=(count, 4, 3))
     parallel = np.where(np.arange(count) % 2 == 0, 50.0, 1e-3)
@@ -91,48 +114,69 @@ def test_derivatives_of_pairs(kind):
         way = np.zeros((count, 12))
         way[:, k] = h
         (e1, f1), (e0, f0) = (
-            pair_forces(launcher, pairs, x + sign * way.reshape(x.shape), 3.0, reach) for sign in (1.0, -1.0)
+            pair_forces(launcher, pairs, x + sign * way.reshape(x.shape), 3.0, reach)
+            for sign in (1.0, -1.0)
         )
-        slopes[:, k], curvatures[:, :, k] = (e1 - e0) / (2 * h), ((f1 - f0) / (2 * h)).reshape(count, 12)
+        slopes[:, k], curvatures[:, :, k] = (
+            (e1 - e0) / (2 * h),
+            ((f1 - f0) / (2 * h)).reshape(count, 12),
+        )
     assert (energy != 0.0).sum() > 200
     size = 1e-3 + np.abs(slopes).max(1)
     assert (np.abs(slopes - force.reshape(count, 12)).max(1) / size).max() < 1e-6
     errors = np.abs(hessian - curvatures).max((1, 2)) / (1e-2 + np.abs(curvatures).max((1, 2)))
-    assert np.quantile(errors, 0.99) < 1e-6  # in between, a difference crosses a change of the nearest feature
+    # In between, a difference crosses a change of the nearest feature.
+    assert np.quantile(errors, 0.99) < 1e-6
 
 
 @pytest.mark.parametrize("kind", [0, 1])
 def test_energies_of_pairs_are_those_of_ipctk(kind):
     """D B(d / D) of vertices beside the inside of a triangle, and of edges with their factor."""
-    ipctk = pytest.importorskip("ipctk", reason="compares with ipctk: pip install 'warp-resphys[test]'")
+    ipctk = pytest.importorskip(
+        "ipctk", reason="compares with ipctk: pip install 'warp-resphys[test]'"
+    )
     random, reach = np.random.default_rng(kind + 5), 0.25
     x = random.normal(size=(4000, 4, 3))
     distance = ipctk.edge_edge_distance if kind else ipctk.point_triangle_distance
     if not kind:  # A vertex near an edge shares its energy among triangles.
         edges = ((1, 2), (1, 3), (2, 3))
-        x = x[[min(ipctk.point_edge_distance(y[0], y[a], y[b]) for a, b in edges) > reach**2 for y in x]]
+        x = x[
+            [
+                min(ipctk.point_edge_distance(y[0], y[a], y[b]) for a, b in edges) > reach**2
+                for y in x
+            ]
+        ]
     d = np.sqrt([distance(*y) for y in x])
     x, d = x[d < reach], d[d < reach]
     count, width = len(x), 20.0  # most edges are almost parallel for it
-    launcher, pairs = pairs_of(np.full(count, kind), x, np.ones(count), np.ones((count, 4)), np.full(count, width))
+    launcher, pairs = pairs_of(
+        np.full(count, kind), x, np.ones(count), np.ones((count, 4)), np.full(count, width)
+    )
     energy, _ = pair_forces(launcher, pairs, x, 1.0, reach)
     # Its barrier is (d - D)^2 ln(d / D) with a minus sign.
     expected = [ipctk.barrier(near, reach) / reach for near in d]
     if kind:
-        expected = [e * ipctk.edge_edge_mollifier(*y, width) for e, y in zip(expected, x, strict=True)]
+        expected = [
+            e * ipctk.edge_edge_mollifier(*y, width) for e, y in zip(expected, x, strict=True)
+        ]
     assert count > 30
     assert energy == pytest.approx(np.array(expected), rel=1e-12)
 
 
 def joined():
     """Two blocks, one above the other, with some disorder in three environments."""
-    mesh = join({"lower": PLATE, "upper": replace(CUBE, vertices=CUBE.vertices + [0.011, 0.009, 0.0125])})
+    mesh = join(
+        {"lower": PLATE, "upper": replace(CUBE, vertices=CUBE.vertices + [0.011, 0.009, 0.0125])}
+    )
     noise = np.random.default_rng(0).normal(size=(3, *mesh.vertices.shape)) * 3e-4
     return mesh, torch.tensor(mesh.vertices + noise)
 
 
 def test_pairs_are_all_pairs_within_reach():
-    """Against the distances of all conceivable pairs; boxes along a way hold those that come within reach on it."""
+    """Against the distances of all conceivable pairs.
+
+    Boxes along a way hold those that come within reach on it.
+    """
     mesh, x = joined()
     surface, reach = Surface.of(mesh), 4e-3
     pairs = PairList(Launcher(3, CPU), surface, reach)
@@ -140,7 +184,9 @@ def test_pairs_are_all_pairs_within_reach():
     vertices, triangles, edges = surface.vertices, surface.triangles, surface.edges
     v, t = (k.ravel() for k in np.meshgrid(vertices, np.arange(len(triangles)), indexing="ij"))
     i, j = np.triu_indices(len(edges), 1)
-    nodes = np.concatenate([np.column_stack([v, triangles[t]]), np.column_stack([edges[i], edges[j]])])
+    nodes = np.concatenate(
+        [np.column_stack([v, triangles[t]]), np.column_stack([edges[i], edges[j]])]
+    )
     kind = np.repeat([0, 1], [len(v), len(i)])
     shared = (np.sort(nodes, 1)[:, 1:] == np.sort(nodes, 1)[:, :-1]).any(1)
     nodes, kind = nodes[~shared], kind[~shared]
@@ -151,7 +197,9 @@ def test_pairs_are_all_pairs_within_reach():
         at = x[b, nodes.reshape(-1)][None].contiguous()
         views = [every, warp_view(at, wp.vec3d)], [warp_view(d, wp.float64)]
         launcher.launch(launcher.record(nearest_points.distances, (len(nodes),), *views))
-        near = {(int(k), *map(int, n)) for k, n in zip(kind[d < reach], nodes[d < reach], strict=True)}
+        near = {
+            (int(k), *map(int, n)) for k, n in zip(kind[d < reach], nodes[d < reach], strict=True)
+        }
         own = pairs.environment == b
         found = pairs.distances(x)[own] < reach
         listed = zip(pairs.kind[own][found].tolist(), pairs.nodes[own][found].tolist(), strict=True)
@@ -165,7 +213,9 @@ def test_pairs_are_all_pairs_within_reach():
     assert pairs.covers(x + 1.0)  # Motion of all together changes no distance.
 
 
-def landing(friction=0.5, integrator="implicit_euler", kappa=KAPPA, rigid="", plate=PLATE, **options):
+def landing(
+    friction=0.5, integrator="implicit_euler", kappa=KAPPA, rigid="", plate=PLATE, **options
+):
     """A cube, of which a `rigid` layer or the whole is rigid, above a plate that is held below."""
     low = CUBE.vertices[CUBE.cells].mean(1)[:, 2] < 0.01
     parts = {"layer": np.flatnonzero(low), "whole": np.arange(len(CUBE.cells))}
@@ -174,7 +224,9 @@ def landing(friction=0.5, integrator="implicit_euler", kappa=KAPPA, rigid="", pl
     plate = Body(plate, fixed=select_vertices(plate, z=0.0))
     contact = SurfaceContact(kappa, friction, slip_speed=1e-2)
     scene = Scene({"plate": plate, "cube": Body(cube, rigid=stiff)}, contact)
-    return Simulator(scene, SOFT, integrator=integrator, **{"time_step": 0.002, "solver": FINE, **options})
+    return Simulator(
+        scene, SOFT, integrator=integrator, **{"time_step": 0.002, "solver": FINE, **options}
+    )
 
 
 def thrown(simulator, velocity, spin, batch=1):
@@ -189,10 +241,13 @@ def thrown(simulator, velocity, spin, batch=1):
 
 
 @pytest.mark.parametrize(
-    ("integrator", "rigid"), [("implicit_euler", "layer"), pytest.param("bdf2", "", marks=pytest.mark.slow)]
+    ("integrator", "rigid"),
+    [("implicit_euler", "layer"), pytest.param("bdf2", "", marks=pytest.mark.slow)],
 )
 def test_gradients_of_an_oblique_impact(integrator, rigid, device):
-    """Throws of a turning cube on a plate, which stick, slide and rebound, against central differences."""
+    """Throws of a turning cube on a plate, which stick,
+    slide and rebound, against central differences.
+    """
     plate = box_tetrahedra((0.04, 0.04, 0.01), (2, 2, 1))
     simulator = landing(integrator=integrator, rigid=rigid, plate=plate, device=device)
     random = np.random.default_rng(0)
@@ -230,7 +285,9 @@ def test_regions_have_their_own_friction():
     contact = SurfaceContact(2e4, 0.2, pairs=pairs)
     slope = math.radians(25.0)
     options = {"gravity": (G * math.sin(slope), 0.0, -G * math.cos(slope)), "solver": FINE}
-    simulator = Simulator(Scene(bodies, contact), replace(SOFT, stiffness_damping=2e-3), 0.005, **options)
+    simulator = Simulator(
+        Scene(bodies, contact), replace(SOFT, stiffness_damping=2e-3), 0.005, **options
+    )
     a, b = (simulator.body.vertex_slice(name) for name in "ab")
     with torch.no_grad():
         half = simulator.rollout(simulator.rest_state(), 20)
@@ -242,7 +299,9 @@ def test_regions_have_their_own_friction():
         assert forces.sticks[0, on].tolist() == [expected == 0.0] * int(on.sum())
         assert int(on.sum()) >= 4
     gain = (path.v[-1, 0, a, 0] - path.v[0, 0, a, 0]).mean()
-    assert float(gain) == pytest.approx(20 * 0.005 * G * (math.sin(slope) - 0.2 * math.cos(slope)), rel=0.01)
+    assert float(gain) == pytest.approx(
+        20 * 0.005 * G * (math.sin(slope) - 0.2 * math.cos(slope)), rel=0.01
+    )
     assert float(path.v[-1, 0, b, 0].mean().abs()) < 1e-3
     assert simulator.parts["surface_friction"] == ("other", "pad")
     check_slopes(
@@ -260,8 +319,12 @@ def test_regions_have_their_own_friction():
     with torch.no_grad():
         held, slides = (s.rollout(s.rest_state(), 10).v[-1, 0, b, 0].mean() for s in (both, other))
     assert float(held) < 1e-3 < 0.1 < float(slides)  # the first pair that fits counts
-    refuses(InputError, "the pair 'pad' of a contact", Simulator, Scene({"a": bodies["a"]}, contact))
-    with pytest.raises(InputError, match=r"FrictionPair\.friction is -1\.0: it must be a number, zero or more"):
+    refuses(
+        InputError, "the pair 'pad' of a contact", Simulator, Scene({"a": bodies["a"]}, contact)
+    )
+    with pytest.raises(
+        InputError, match=r"FrictionPair\.friction is -1\.0: it must be a number, zero or more"
+    ):
         SurfaceContact(pairs={"pad": FrictionPair(first="a", second="b", friction=-1.0)})
     for wrong in (
         [FrictionPair(first="a", second="b", friction=1.0)],
@@ -274,10 +337,13 @@ def test_regions_have_their_own_friction():
 
 def test_momentum_is_conserved():
     """Two free bodies collide with friction: the sum of momenta stays what it was."""
-    cube, other = turned(CUBE, (0.3, 0.2), (0.0, 0.0, 0.0)), turned(CUBE, (0.9, -0.4), (0.004, 0.003, 0.036))
+    cube = turned(CUBE, (0.3, 0.2), (0.0, 0.0, 0.0))
+    other = turned(CUBE, (0.9, -0.4), (0.004, 0.003, 0.036))
     scene = Scene({"one": Body(cube), "two": Body(other)}, SurfaceContact(KAPPA, 0.6))
     solver = SolverSettings(relative_tolerance=1e-13, absolute_tolerance=1e-15)
-    simulator = Simulator(scene, SOFT, time_step=0.002, gravity=(0.0, 0.0, 0.0), integrator="bdf2", solver=solver)
+    simulator = Simulator(
+        scene, SOFT, time_step=0.002, gravity=(0.0, 0.0, 0.0), integrator="bdf2", solver=solver
+    )
     rest = simulator.rest_state()
     rest.v[:, scene.vertex_slice("two")] = simulator.tensor([0.2, -0.1, -2.5])
     path = simulator.rollout(rest, 20)
@@ -314,7 +380,8 @@ def test_a_body_touches_itself(device):
     assert crossings["free"] > 0 == crossings["touching"]
     forces = simulator.contacts(before, path.final, pressed)["surfaces"]
     with torch.no_grad():
-        assert float(forces.normal.sum((0, 1)).norm()) < 1e-6 * float(forces.normal.norm())  # action and reaction
+        # Action and reaction.
+        assert float(forces.normal.sum((0, 1)).norm()) < 1e-6 * float(forces.normal.norm())
         assert float(forces.friction.sum((0, 1)).norm()) < 1e-6 * float(forces.friction.norm())
         assert 0.0 < float(forces.gap.min()) < D
         assert float(forces.normal.norm()) > 0.01
@@ -322,7 +389,9 @@ def test_a_body_touches_itself(device):
 
 @pytest.mark.parametrize("rigid", [pytest.param("", marks=pytest.mark.slow), "layer"])
 def test_batch_is_what_its_environments_are_alone(rigid, device):
-    """Four environments with different contacts in one batch are what they are alone, on a CPU bit for bit."""
+    """Four environments with different contacts in one batch are what they are alone, on a CPU bit
+    for bit.
+    """
     random = np.random.default_rng(1)
     velocity = torch.tensor(random.uniform([-0.6, -0.6, -2.0], [0.6, 0.6, 1.0], (4, 3)))
     spin = torch.linspace(-4.0, 4.0, 4, dtype=torch.float64)
@@ -346,7 +415,9 @@ def test_the_matrix_of_a_step_has_its_pairs(rigid):
     matrix, _ = step.matrix(x)
     way = torch.tensor(np.random.default_rng(0).normal(size=(1, len(step.free), 3)))
     ways = torch.zeros_like(x).index_copy(1, step.free, way)
-    expected = (step.residual(x + 1e-9 * ways) - step.residual(x - 1e-9 * ways))[:, step.free] / 2e-9
+    expected = (step.residual(x + 1e-9 * ways) - step.residual(x - 1e-9 * ways))[
+        :, step.free
+    ] / 2e-9
     step.update(x)
     close = pytest.approx(expected.numpy(), abs=1e-5 * float(expected.norm()))
     assert step.product(ways)[:, step.free].numpy() == close
@@ -356,7 +427,10 @@ def test_the_matrix_of_a_step_has_its_pairs(rigid):
 
 @pytest.mark.parametrize("rise", [2e-3, pytest.param(0.03, marks=pytest.mark.slow)])
 def test_driven_vertices_push_in_one_step(rise, device):
-    """A plate that goes up by more than the gap below a cube, or its height, lifts it; momentum and gradient."""
+    """A plate that goes up by more than the gap below a cube, or its height, lifts it.
+
+    Momentum and gradient.
+    """
     simulator = landing(device=device)
     rest = simulator.rest_state()
     place = simulator.rest_positions[simulator.fixed].clone()
@@ -367,7 +441,8 @@ def test_driven_vertices_push_in_one_step(rise, device):
     pairs = PairList(Launcher(1, rest.q.device), Surface.of(simulator.body.mesh), D)
     assert int(pairs.crossings(after.q)[0]) == 0
     assert float(after.q[0, cube, 2].min()) > 0.01 + 0.9 * rise
-    forces, mass = simulator.contacts(rest, after, inputs)["surfaces"], simulator.prepare().mass[0, cube]
+    forces = simulator.contacts(rest, after, inputs)["surfaces"]
+    mass = simulator.prepare().mass[0, cube]
     lift = float(forces.normal[0, forces.vertices >= cube.start, 2].detach().sum())
     gain = after.v[0, cube, 2] - simulator.time_step * simulator.gravity[2]
     impulse = float((mass * gain).sum())
@@ -389,22 +464,54 @@ def test_driven_vertices_push_in_one_step(rise, device):
 
 def test_refusals():
     cube = replace(CUBE, vertices=CUBE.vertices + [0.0102, 0.0103, 0.01 + 1e-12])
-    refuses(InputError, "touch at rest", Simulator, Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
+    refuses(
+        InputError,
+        "touch at rest",
+        Simulator,
+        Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()),
+    )
     cube = replace(CUBE, vertices=CUBE.vertices + [0.01, 0.01, 0.005])
     words = r"cross at rest: an edge .* 'plate'.*; deepest is vertex \d+ in '(cube|plate)', by 5 mm"
-    refuses(InputError, words, Simulator, Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
+    refuses(
+        InputError,
+        words,
+        Simulator,
+        Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()),
+    )
     within = Body(replace(CUBE, vertices=0.2 * CUBE.vertices + [0.01, 0.01, 0.003]))
-    words = r"a body with vertex \d+ in 'cube' is within that with vertex \d+ in 'plate' at rest: move"
-    refuses(InputError, words, Simulator, Scene({"plate": Body(PLATE), "cube": within}, SurfaceContact(distance=1e-4)))
-    refuses(InputError, "mm from itself", Simulator, Body(clip(), energies=[SurfaceContact(distance=0.02)]))
+    words = (
+        r"a body with vertex \d+ in 'cube' is within that with vertex \d+ in 'plate' at rest: move"
+    )
+    refuses(
+        InputError,
+        words,
+        Simulator,
+        Scene({"plate": Body(PLATE), "cube": within}, SurfaceContact(distance=1e-4)),
+    )
+    refuses(
+        InputError,
+        "mm from itself",
+        Simulator,
+        Body(clip(), energies=[SurfaceContact(distance=0.02)]),
+    )
     refuses(InputError, "distance of a contact between surfaces", SurfaceContact, distance=0.0)
     refuses(InputError, "surface_friction", SurfaceContact, friction=-0.1)
     with pytest.raises(InputError, match="symmetry planes"):
-        Simulator(Body(CUBE, symmetry=[SymmetryPlane((1.0, 0.0, 0.0))], energies=[SurfaceContact()]))
-    refuses(InputError, "midpoint", Simulator, Body(CUBE, energies=[SurfaceContact()]), integrator="midpoint")
+        Simulator(
+            Body(CUBE, symmetry=[SymmetryPlane((1.0, 0.0, 0.0))], energies=[SurfaceContact()])
+        )
+    refuses(
+        InputError,
+        "midpoint",
+        Simulator,
+        Body(CUBE, energies=[SurfaceContact()]),
+        integrator="midpoint",
+    )
     simulator = landing()
     smaller, cube = simulator.rest_positions.clone(), simulator.body.vertex_slice("cube")
-    smaller[cube] = 0.2 * (smaller[cube] - smaller[cube].mean(0)) + smaller.new_tensor([0.02, 0.02, 0.005])
+    smaller[cube] = 0.2 * (smaller[cube] - smaller[cube].mean(0)) + smaller.new_tensor(
+        [0.02, 0.02, 0.005]
+    )
     words = r"vertex \d+ in 'cube' is within that with .* in 'plate' at the start .* environment 0"
     refuses(InputError, words, simulator.step, simulator.state(smaller))
     crossing = simulator.rest_positions.clone()
@@ -413,7 +520,10 @@ def test_refusals():
 
 
 def test_a_ball_in_a_hollow_is_not_within_the_body_around_it():
-    """A shell with a ball in its hollow; the ball in the solid of a cube is seen, in its environment alone."""
+    """A shell with a ball in its hollow.
+
+    The ball in the solid of a cube is seen, in its environment alone.
+    """
     shell = box_hexahedra((0.03, 0.03, 0.03), (3, 3, 3))
     middle = np.abs(shell.vertices[shell.cells].mean(1) - 0.015).max(1) < 1e-3
     hollow = Mesh(shell.vertices, shell.cells[~middle])
@@ -421,7 +531,10 @@ def test_a_ball_in_a_hollow_is_not_within_the_body_around_it():
     pairs = {}
     for name, mesh in (("hollow", hollow), ("solid", shell)):
         both = join({"outer": mesh, "ball": ball})
-        pairs[name] = PairList(Launcher(2, CPU), Surface.of(both), 1e-4), torch.tensor(both.vertices).repeat(2, 1, 1)
+        pairs[name] = (
+            PairList(Launcher(2, CPU), Surface.of(both), 1e-4),
+            torch.tensor(both.vertices).repeat(2, 1, 1),
+        )
         pairs[name][1][1, -8:] += 0.1
     assert pairs["hollow"][0].enclosed(pairs["hollow"][1]).tolist() == [[-1, -1]] * 2
     (inside, outer), other = pairs["solid"][0].enclosed(pairs["solid"][1]).tolist()

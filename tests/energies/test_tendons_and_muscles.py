@@ -1,4 +1,6 @@
-"""Tendons and contractile fibres against closed forms, differences, and what cannot be routed or contract."""
+"""Tendons and contractile fibres against closed forms,
+differences, and what cannot be routed or contract.
+"""
 
 import math
 from dataclasses import replace
@@ -9,7 +11,15 @@ import torch
 
 from support.clamped import clamped
 from support.slopes import check_rows
-from warp_resphys import Corotated, Inputs, Simulator, SolverSettings, Tendons, box_hexahedra, box_tetrahedra
+from warp_resphys import (
+    Corotated,
+    Inputs,
+    Simulator,
+    SolverSettings,
+    Tendons,
+    box_hexahedra,
+    box_tetrahedra,
+)
 from warp_resphys.energies.muscles import Muscle, Muscles
 from warp_resphys.io.errors import InputError
 from warp_resphys.settings.body import Route
@@ -29,27 +39,42 @@ def route(height, count=7, depth=SIZE[1] / 2, length=SIZE[0]):
 
 
 def simulator(*routes, mesh=BEAM, material=SOFT, solver=TIGHT, **more):
-    return Simulator(clamped(mesh, energies=(Tendons(routes, **more),)), material, gravity=WEIGHTLESS, solver=solver)
+    return Simulator(
+        clamped(mesh, energies=(Tendons(routes, **more),)),
+        material,
+        gravity=WEIGHTLESS,
+        solver=solver,
+    )
 
 
 def test_an_offset_tendon_bends_a_beam_to_a_constant_curvature():
-    """M = T e along the beam: for small T the curvature is T e / (E I), the compression T / (E A)."""
+    """M = T e along the beam: for small T the curvature is T e / (E I),
+    the compression T / (E A).
+    """
     mesh = box_hexahedra((0.2, 0.01, 0.01), (20, 2, 2), nodes=27)
     offset, pull, modulus = 0.003, 0.1, 264e3
     material = Corotated(modulus, 0.0)
     sim = simulator(route(0.005 + offset, 41, 0.005, 0.2), mesh=mesh, material=material)
     q = sim.static_equilibrium(Inputs(tendon_tension=pull)).q[0].numpy()
-    middle = [int(np.argmin(np.linalg.norm(mesh.vertices - [x, 0.005, 0.005], axis=1))) for x in (0.1, 0.2)]
+    middle = [
+        int(np.argmin(np.linalg.norm(mesh.vertices - [x, 0.005, 0.005], axis=1)))
+        for x in (0.1, 0.2)
+    ]
     bend = pull * offset / (modulus * 0.01**4 / 12)
     angle, shortening = bend * 0.2, 1.0 - pull / (modulus * 1e-4)
     assert angle > 0.2  # no small rotation
     for vertex, x in zip(middle, (0.1, 0.2), strict=True):
-        expected = [math.sin(bend * x) / bend * shortening, 0.005, 0.005 + (1.0 - math.cos(bend * x)) / bend]
+        expected = [
+            math.sin(bend * x) / bend * shortening,
+            0.005,
+            0.005 + (1.0 - math.cos(bend * x)) / bend,
+        ]
         np.testing.assert_allclose(q[vertex], expected, atol=0.02 * abs(expected[2] - 0.005))
 
 
 @pytest.mark.parametrize(
-    ("solver", "linear"), [("newton", "dense"), ("quasi_newton", "banded"), ("projective_dynamics", "sparse")]
+    ("solver", "linear"),
+    [("newton", "dense"), ("quasi_newton", "banded"), ("projective_dynamics", "sparse")],
 )
 def test_a_winch_shortens_a_stiff_tendon_by_what_it_takes_in(solver, linear):
     settings = SolverSettings(name=solver, relative_tolerance=1e-9, linear_solver=linear)
@@ -65,7 +90,9 @@ def test_a_winch_shortens_a_stiff_tendon_by_what_it_takes_in(solver, linear):
     torch.testing.assert_close(slack[0], sim.rest_positions, rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", [box_hexahedra(SIZE, DIVISIONS), box_tetrahedra(SIZE, (4, 1, 1), order=2)])
+@pytest.mark.parametrize(
+    "kind", [box_hexahedra(SIZE, DIVISIONS), box_tetrahedra(SIZE, (4, 1, 1), order=2)]
+)
 def test_guides_are_where_they_were_put(kind):
     """Also between the vertices, and where the body's surface bounds them."""
     places = np.array([[0.001, 0.003, 0.0171], [0.0433, 0.01, 0.02], [0.118, 0.0199, 0.0001]])
@@ -77,11 +104,18 @@ def test_guides_are_where_they_were_put(kind):
 ACROSS = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]  # a beam's tendons
 
 
-@pytest.mark.parametrize(("solver", "offset"), [("quasi_newton", (5e-3, 0.0)), ("projective_dynamics", (0.0, 5e-3))])
+@pytest.mark.parametrize(
+    ("solver", "offset"), [("quasi_newton", (5e-3, 0.0)), ("projective_dynamics", (0.0, 5e-3))]
+)
 def test_a_tendon_that_is_off_is_one_that_was_routed_there(solver, offset):
-    """In a beam's cells shape functions are linear along each axis: an offset along one is exact."""
+    """In a beam's cells shape functions are linear along each axis:
+    an offset along one is exact.
+    """
     settings = SolverSettings(name=solver, relative_tolerance=1e-10)
-    tapering = np.linspace([0.0, 1.0, 0.0], [0.0, 0.2, 0.0], 7), np.linspace([0.0, 0.0, 0.1], [0.0, 0.0, 1.0], 7)
+    tapering = (
+        np.linspace([0.0, 1.0, 0.0], [0.0, 0.2, 0.0], 7),
+        np.linspace([0.0, 0.0, 0.1], [0.0, 0.0, 1.0], 7),
+    )
     drive = Inputs(tendon_tension=0.5, tendon_contraction=4e-3)
     off = Route(guides=route(0.013, depth=0.013), offsets=[way.tolist() for way in tapering])
     tendons = Tendons([off], stiffness=2000.0)
@@ -90,14 +124,18 @@ def test_a_tendon_that_is_off_is_one_that_was_routed_there(solver, offset):
         for own in (tendons, tendons.rerouted([offset]))
     ]
     given = {f"tendon_offset_{number}": value for number, value in enumerate(offset, 1)}
-    q, expected = (sim.step(sim.rest_state(), drive, its).q for sim, its in zip(sims, (given, None), strict=True))
+    q, expected = (
+        sim.step(sim.rest_state(), drive, its).q
+        for sim, its in zip(sims, (given, None), strict=True)
+    )
     torch.testing.assert_close(q, expected, rtol=0.0, atol=1e-9)
     assert float((expected - sims[0].rest_positions).abs().max()) > 1e-3
     assert float((sims[0].step(sims[0].rest_state(), drive).q - expected).abs().max()) > 1e-4
 
 
 @pytest.mark.parametrize(
-    ("integrator", "start", "poissons_ratio"), [*zip(INTEGRATORS, POSES, (0.45, 0.45, 0.499), strict=True)]
+    ("integrator", "start", "poissons_ratio"),
+    [*zip(INTEGRATORS, POSES, (0.45, 0.45, 0.499), strict=True)],
 )
 def test_gradients(start, integrator, poissons_ratio):
     """With a winch and a commanded tension at once, and by where tendons run."""
@@ -122,7 +160,10 @@ def test_gradients(start, integrator, poissons_ratio):
             "tendon_1.guides is [[0.0, 0.0, 0.0]]: it must be a list of two or more",
         ),
         (lambda: Tendons([route(0.01), np.full((2, 3), np.nan)]), "tendon_2.guides is [[nan"),
-        (lambda: Tendons([route(0.01)[[0, 1, 1]]]), "tendon_1.guides has two in a row at one place"),
+        (
+            lambda: Tendons([route(0.01)[[0, 1, 1]]]),
+            "tendon_1.guides has two in a row at one place",
+        ),
         (lambda: Tendons([route(0.01)], stiffness=-1.0), "tendon_stiffness is"),
         (lambda: Tendons([route(0.01)], toe=0.0), "the toe of tendons is 0"),
         (
@@ -132,10 +173,19 @@ def test_gradients(start, integrator, poissons_ratio):
         (lambda: Route(guides=route(0.01), offsets=[*ACROSS, ACROSS[0]]), "Route.offsets is"),
         (lambda: Route(guides=route(0.01), offsets=["up"]), "Route.offsets is ['up']"),
         (lambda: Route(guides=route(0.01), offsets=[[1.0, 0.0]]), "Route.offsets is [[1.0, 0.0]]"),
-        (lambda: Route(guides=route(0.01), offsets=[ACROSS]), "offsets has a direction for 2 guides"),
+        (
+            lambda: Route(guides=route(0.01), offsets=[ACROSS]),
+            "offsets has a direction for 2 guides",
+        ),
         (lambda: Route(guides=route(0.01), offsets=[[0.0, 0.0, 0.0]]), "not all zero"),
-        (lambda: simulator(route(0.018)).static_equilibrium(Inputs(tendon_tension=-1.0)), "tendon_tension is"),
-        (lambda: simulator(route(0.01), route(0.03)), "guide 1 of tendon 2, at [0.0, 0.01, 0.03] m, lies 10 mm"),
+        (
+            lambda: simulator(route(0.018)).static_equilibrium(Inputs(tendon_tension=-1.0)),
+            "tendon_tension is",
+        ),
+        (
+            lambda: simulator(route(0.01), route(0.03)),
+            "guide 1 of tendon 2, at [0.0, 0.01, 0.03] m, lies 10 mm",
+        ),
     ],
 )
 def test_what_cannot_be_routed_is_refused(make, said):
@@ -154,12 +204,16 @@ def whole(mesh):
 
 
 def upper(mesh):
-    return Muscle(np.flatnonzero(mesh.vertices[mesh.cells].mean(axis=1)[:, 2] > SIZE[2] / 2), ALONG, "upper")
+    return Muscle(
+        np.flatnonzero(mesh.vertices[mesh.cells].mean(axis=1)[:, 2] > SIZE[2] / 2), ALONG, "upper"
+    )
 
 
 def contracting(*muscles, mesh=BEAM, ratio=0.0, solver=TIGHT, **more):
     body = clamped(mesh, energies=(Muscles(muscles, **more),))
-    return Simulator(body, Corotated(MODULUS, ratio, mass_damping=0.5), gravity=(0.0, 0.0, 0.0), solver=solver)
+    return Simulator(
+        body, Corotated(MODULUS, ratio, mass_damping=0.5), gravity=(0.0, 0.0, 0.0), solver=solver
+    )
 
 
 def stretch(sim, inputs):
@@ -192,7 +246,9 @@ def test_a_contraction_shares_the_strain_with_the_solid():
 def test_gradients_of_muscles(start, integrator):
     solver = SolverSettings(relative_tolerance=1e-11, linear_solver="banded")
     slanted = Muscle(np.arange(8), np.random.default_rng(0).normal(size=(8, 3)))
-    sim = contracting(upper(BEAM), slanted, ratio=0.45, stiffness=np.array([4e5, 9e5]), toe=1.0, solver=solver)
+    sim = contracting(
+        upper(BEAM), slanted, ratio=0.45, stiffness=np.array([4e5, 9e5]), toe=1.0, solver=solver
+    )
     material = replace(sim.material, stiffness_damping=1e-3)
     sim = replace(sim, material=material, integrator=integrator, gravity=(0.0, 0.0, -9.8))
     names = "muscle_stress", "muscle_contraction", "muscle_stiffness, each muscle"
@@ -205,11 +261,20 @@ def test_gradients_of_muscles(start, integrator):
         (lambda: Muscles([]), "there is no muscle"),
         (lambda: Muscles([Muscle([], ALONG)]), "'muscle_1'"),
         (lambda: Muscles([Muscle([0.5], ALONG)]), "give the numbers of one or more"),
-        (lambda: Muscles([Muscle([0, 1], np.ones((3, 3)), "left")]), "'left' has directions of shape (3, 3)"),
-        (lambda: Muscles([Muscle([0], (0.0, 0.0, 0.0))]), "has a direction that is zero or not finite"),
+        (
+            lambda: Muscles([Muscle([0, 1], np.ones((3, 3)), "left")]),
+            "'left' has directions of shape (3, 3)",
+        ),
+        (
+            lambda: Muscles([Muscle([0], (0.0, 0.0, 0.0))]),
+            "has a direction that is zero or not finite",
+        ),
         (lambda: Muscles([replace(whole(BEAM), name="a")] * 2), "muscles are called a, a"),
         (lambda: Muscles([whole(BEAM)], stiffness=-1.0), "muscle_stiffness is"),
-        (lambda: Muscles([whole(BEAM)], toe=0.0), "the strain over which muscle fibres tighten is 0"),
+        (
+            lambda: Muscles([whole(BEAM)], toe=0.0),
+            "the strain over which muscle fibres tighten is 0",
+        ),
         (lambda: contracting(Muscle([99], ALONG)), "runs through cell 99, but there are 24"),
     ],
 )

@@ -9,7 +9,11 @@ from warp_resphys.environments import making
 SHORT = [*DRIVEN, "data.steps=30", "mesh_check=null"]
 RUN = ["experiment=tendon_rod", *ROD, *SHORT]
 BOX = "boxes: [[[-0.007, -0.007, -0.08], [0.007, 0.007, 0.0]]]"
-MESHES = ["mesh.size=0.014", f"laboratory.mesh={{kind: boxes, {BOX}, size: 0.01}}", "laboratory.time_step=0.01"]
+MESHES = [
+    "mesh.size=0.014",
+    f"laboratory.mesh={{kind: boxes, {BOX}, size: 0.01}}",
+    "laboratory.time_step=0.01",
+]
 FINGER = ["experiment=finger", *MESHES, *SHORT]
 
 

@@ -1,4 +1,6 @@
-"""Gymnasium environments on small runs: seeds, resets in all modes, refusals, and two fingers as a gripper."""
+"""Gymnasium environments on small runs: seeds, resets in all modes,
+refusals, and two fingers as a gripper.
+"""
 
 from dataclasses import replace
 
@@ -46,11 +48,16 @@ def played(environment, steps=6, seed=3):
 @pytest.mark.slow
 class TestGymnasium:
     @pytest.mark.usefixtures("can_draw")
-    @pytest.mark.parametrize("task", [task for task in TASKS if task not in ("grasp", "pick_and_place")])
+    @pytest.mark.parametrize(
+        "task", [task for task in TASKS if task not in ("grasp", "pick_and_place")]
+    )
     def test_its_checker_passes(self, folder, task):
         name = "".join(word.capitalize() for word in task.split("_"))
-        environment = gym.make(f"warp_resphys/{name}-v0", run=folder, render_mode="rgb_array", **QUICK)
-        check_env(environment.unwrapped, skip_render_check=task != "reach")  # the pictures are alike
+        environment = gym.make(
+            f"warp_resphys/{name}-v0", run=folder, render_mode="rgb_array", **QUICK
+        )
+        # The pictures are alike.
+        check_env(environment.unwrapped, skip_render_check=task != "reach")
         environment.close()
 
     def test_a_vector_of_them_is_made_by_name(self, folder):
@@ -89,12 +96,15 @@ class TestResets:
         seen, rewards, ends = played(environment, 6)
         np.testing.assert_array_equal(ends, [[False] * 2] * 3 + [[True] * 2] + [[False] * 2] * 2)
         np.testing.assert_array_equal(rewards[4], [0.0, 0.0])
-        width = environment.single_observation_space.shape[0] - 12  # markers, before commands and goals
+        # Markers, before commands and goals.
+        width = environment.single_observation_space.shape[0] - 12
         assert np.abs(seen[4][:, :width]).max() > 0.05
         assert np.abs(seen[5][:, :width]).max() < 0.02
 
     def test_the_same_step_begins_anew_and_keeps_the_last_observation(self, folder):
-        environment = make_vector("reach", folder, 2, autoreset_mode=AutoresetMode.SAME_STEP, **QUICK)
+        environment = make_vector(
+            "reach", folder, 2, autoreset_mode=AutoresetMode.SAME_STEP, **QUICK
+        )
         environment.reset(seed=1)
         action = np.ones((2, 3), dtype=np.float32)
         action[:, 1:] = -1.0
@@ -106,7 +116,9 @@ class TestResets:
         assert np.abs(seen[0][:9]).max() < 0.02
 
     def test_a_finished_episode_must_be_reset_without_autoreset(self, folder):
-        environment = make_vector("reach", folder, 2, autoreset_mode=AutoresetMode.DISABLED, **QUICK)
+        environment = make_vector(
+            "reach", folder, 2, autoreset_mode=AutoresetMode.DISABLED, **QUICK
+        )
         environment.reset(seed=1)
         action = np.zeros((2, 3), dtype=np.float32)
         for _ in range(4):
@@ -150,7 +162,9 @@ class TestWorlds:
 
 
 class Brittle(World):
-    """A point that moves to its command at once, and fails in the second of the five steps of its third action."""
+    """A point that moves to its command at once, and fails
+    in the second of the five steps of its third action.
+    """
 
     def __init__(self):
         self.count, self.time_step, self.input, self.parts, self.number = 2, 0.01, "place", 1, 0
@@ -160,7 +174,9 @@ class Brittle(World):
         self.number += 1
         q = torch.zeros(2, 1, 3)
         q[:, 0, :1] = torch.as_tensor(commands)
-        return State(q, state.v).with_memory({"lost": state.lost | torch.tensor([self.number == 12, False])})
+        return State(q, state.v).with_memory(
+            {"lost": state.lost | torch.tensor([self.number == 12, False])}
+        )
 
     def markers(self, state):
         return state.q.numpy()
@@ -174,18 +190,30 @@ def test_a_failure_in_any_step_of_an_action_ends_the_episode():
     robots.reset(seed=0)
     steps = [robots.step(np.ones((2, 1), dtype=np.float32)) for _ in range(5)]
     _, rewards, terminated, _, infos = zip(*steps, strict=True)
-    np.testing.assert_array_equal(terminated, [[False] * 2] * 2 + [[True, False]] + [[False] * 2] * 2)
+    np.testing.assert_array_equal(
+        terminated, [[False] * 2] * 2 + [[True, False]] + [[False] * 2] * 2
+    )
     assert rewards[2][0] == -10.0
     assert rewards[3][0] == 0.0  # The next step resets it.
-    np.testing.assert_allclose(infos[3]["error_mm"][0], 1e3 * np.linalg.norm(robots.task.goals[0, 0]))
-    for given, said in ({"forces": True}, "forces need a simulator"), ({"squeeze": 0.1}, "squeeze is for fingers"):
-        refuses(InputError, said, RobotVectorEnv, Brittle(), robots.task, mapping, np.eye(3), 6, **given)
+    np.testing.assert_allclose(
+        infos[3]["error_mm"][0], 1e3 * np.linalg.norm(robots.task.goals[0, 0])
+    )
+    for given, said in (
+        ({"forces": True}, "forces need a simulator"),
+        ({"squeeze": 0.1}, "squeeze is for fingers"),
+    ):
+        refuses(
+            InputError, said, RobotVectorEnv, Brittle(), robots.task, mapping, np.eye(3), 6, **given
+        )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("world", ["simulator", "laboratory"])
 def test_the_force_at_the_base_is_the_weight_at_rest_and_observed_last(folder, world):
-    plain, felt = (make_vector("reach", folder, 2, world=world, **QUICK, forces=forces) for forces in (False, True))
+    plain, felt = (
+        make_vector("reach", folder, 2, world=world, **QUICK, forces=forces)
+        for forces in (False, True)
+    )
     (seen, rewards, _), (more, same, _) = played(plain), played(felt)
     np.testing.assert_array_equal(more[..., :-3], seen)
     np.testing.assert_array_equal(rewards, same)
@@ -203,19 +231,27 @@ class TestPictures:
         environment.reset(seed=2)
         first = environment.render()
         assert len(first) == 2
-        assert all(picture.shape == (480, 480, 3) and picture.dtype == np.uint8 for picture in first)
+        assert all(
+            picture.shape == (480, 480, 3) and picture.dtype == np.uint8 for picture in first
+        )
         for _ in range(3):
             environment.step(np.array([[1.0, -1.0, -1.0], [-1.0, -1.0, 1.0]], dtype=np.float32))
         later = environment.render()
         blue, red = (
-            [np.argwhere(pixels[..., one] > pixels[..., other] + 40.0) for pixels in map(np.int64, (*first, *later))]
+            [
+                np.argwhere(pixels[..., one] > pixels[..., other] + 40.0)
+                for pixels in map(np.int64, (*first, *later))
+            ]
             for one, other in ((2, 0), (0, 2))
         )
         assert min(map(len, blue)) > 1000  # the body
         assert min(map(len, red)) > 20  # the goal
-        assert np.linalg.norm(blue[0].mean(axis=0) - blue[2].mean(axis=0)) > 2.0  # The first robot moved.
-        assert np.linalg.norm(blue[2].mean(axis=0) - blue[3].mean(axis=0)) > 2.0  # The second moved elsewhere.
-        np.testing.assert_allclose(red[0].mean(axis=0), red[2].mean(axis=0), atol=8.0)  # The goal stays in place.
+        # The first robot moved.
+        assert np.linalg.norm(blue[0].mean(axis=0) - blue[2].mean(axis=0)) > 2.0
+        # The second moved elsewhere.
+        assert np.linalg.norm(blue[2].mean(axis=0) - blue[3].mean(axis=0)) > 2.0
+        # The goal stays in place.
+        np.testing.assert_allclose(red[0].mean(axis=0), red[2].mean(axis=0), atol=8.0)
         environment.close()
 
     @pytest.mark.slow
@@ -226,7 +262,9 @@ class TestPictures:
         for up in (1.0, -1.0):
             camera = Camera(np.array([0.0, 0.0, up]), corners, ObstacleSurface())
             nothing = np.zeros((0, 3), dtype=np.int64)
-            (pixels,) = camera.pictures(nothing, corners[None], corners[None, :1], [corners[1:2]], [""])
+            (pixels,) = camera.pictures(
+                nothing, corners[None], corners[None, :1], [corners[1:2]], [""]
+            )
             camera.close()
             red = np.argwhere(pixels[..., 0] > pixels[..., 2] + 40.0)
             assert len(red) > 20
@@ -245,7 +283,12 @@ class TestPictures:
     ],
 )
 def test_invalid_arguments_are_refused(folder, change, said):
-    refuses(InputError, said, make_vector, **{"task": "reach", "run": folder, "num_envs": 1, **QUICK, **change})
+    refuses(
+        InputError,
+        said,
+        make_vector,
+        **{"task": "reach", "run": folder, "num_envs": 1, **QUICK, **change},
+    )
 
 
 @pytest.mark.slow
@@ -253,7 +296,9 @@ def test_steps_need_a_reset_and_actions_their_shape(folder):
     environment = make_vector("reach", folder, 2, **QUICK)
     refuses(InputError, "not reset", environment.step, np.zeros((2, 3), dtype=np.float32))
     environment.reset(seed=0)
-    refuses(InputError, r"actions have shape \(3,\)", environment.step, np.zeros(3, dtype=np.float32))
+    refuses(
+        InputError, r"actions have shape \(3,\)", environment.step, np.zeros(3, dtype=np.float32)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -276,7 +321,9 @@ def test_a_trial_commands_its_inputs(robot):
         np.testing.assert_allclose(live.positions, motion.q[number + 1, 0], rtol=0.0, atol=1e-9)
         for frame in np.flatnonzero(np.isclose(live.trial.times, live.time, atol=1e-9)):
             np.testing.assert_allclose(live.markers, shown[frame], rtol=0.0, atol=1e-9)
-            np.testing.assert_allclose(live.measured, live.trial.markers[frame], rtol=0.0, atol=1e-9)
+            np.testing.assert_allclose(
+                live.measured, live.trial.markers[frame], rtol=0.0, atol=1e-9
+            )
 
 
 @pytest.mark.slow
@@ -303,14 +350,21 @@ def test_markers_observed_in_their_own_frame_are_shown_on_the_body(robot):
     np.testing.assert_allclose(turned.positions, plain.positions, rtol=0.0, atol=1e-9)
     assert np.abs(observed - plain.markers).max() > 1e-4
     np.testing.assert_allclose(turned.markers, plain.markers, rtol=0.0, atol=1e-8)
-    np.testing.assert_allclose(kabsch(observed, plain.markers).apply(observed), plain.markers, atol=1e-8)
+    np.testing.assert_allclose(
+        kabsch(observed, plain.markers).apply(observed), plain.markers, atol=1e-8
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("can_draw")
 def test_gymnasiums_checker_passes(fingers):
     environment = gym.make(
-        "warp_resphys/Grasp-v0", run=fingers, model="sysid", seconds=0.2, action_time=0.05, render_mode="rgb_array"
+        "warp_resphys/Grasp-v0",
+        run=fingers,
+        model="sysid",
+        seconds=0.2,
+        action_time=0.05,
+        render_mode="rgb_array",
     )
     check_env(environment.unwrapped)
     environment.close()
@@ -334,7 +388,9 @@ def test_a_firm_grasp_lifts_the_ball_and_a_loose_one_does_not(fingers, world):
 @pytest.mark.slow
 def test_fingers_feel_the_ball_and_pay_for_a_squeeze(fingers):
     plain, felt = (
-        make_vector("grasp", fingers, 1, "sysid", seconds=1.0, noise=0.0, forces=bool(cost), squeeze=cost)
+        make_vector(
+            "grasp", fingers, 1, "sysid", seconds=1.0, noise=0.0, forces=bool(cost), squeeze=cost
+        )
         for cost in (0.0, 0.2)
     )
     policy = ScriptedGrasp(1.0)
@@ -345,16 +401,20 @@ def test_fingers_feel_the_ball_and_pay_for_a_squeeze(fingers):
         (seen, reward, *_), (more, paid, *_) = plain.step(action), felt.step(action)
         np.testing.assert_array_equal(more[:, :-6], seen)
         left, right = more[0, -6:].reshape(2, 3).astype(np.float64)
-        excess = max(0.5 * (left - right)[0] - 0.5 / 0.8, 0.0)  # friction of 0.8 holds half of the ball
+        # Friction of 0.8 holds half of the ball.
+        excess = max(0.5 * (left - right)[0] - 0.5 / 0.8, 0.0)
         np.testing.assert_allclose(paid, reward - 0.2 * excess, atol=1e-5)
     assert excess > 0.2
     weight = float(felt.world._scene.constants.load_mass.sum()) / 0.01 * 9.80709 / 9.81
-    assert (left + right)[2] == pytest.approx(weight, rel=0.01)  # of the fingers and the ball in the air
+    # Of the fingers and the ball in the air.
+    assert (left + right)[2] == pytest.approx(weight, rel=0.01)
 
 
 @pytest.mark.slow
 def test_grippers_are_what_they_are_alone_and_begin_anew(fingers):
-    together, alone = (make_vector("grasp", fingers, n, "resphys", seconds=0.3, noise=0.0) for n in (3, 1))
+    together, alone = (
+        make_vector("grasp", fingers, n, "resphys", seconds=0.3, noise=0.0) for n in (3, 1)
+    )
     actions = np.array([[[-0.5, -1.0], [0.4, 0.0], [1.0, 1.0]]] * 4, dtype=np.float32)
     first = together.reset(seed=0)[0]
     alone.reset(seed=1)
@@ -367,5 +427,13 @@ def test_grippers_are_what_they_are_alone_and_begin_anew(fingers):
 
 @pytest.mark.slow
 def test_what_cannot_grasp_is_refused(fingers, folder):
-    refuses(InputError, "contact, which reduced models lack", make_vector, "grasp", fingers, 1, world="reduced")
+    refuses(
+        InputError,
+        "contact, which reduced models lack",
+        make_vector,
+        "grasp",
+        fingers,
+        1,
+        world="reduced",
+    )
     refuses(InputError, "this robot has front, left, right", make_vector, "grasp", folder, 1)

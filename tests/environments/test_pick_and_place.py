@@ -1,4 +1,6 @@
-"""An arm that picks a ball and places it: its task, Gymnasium's checker, batches, and the scripted policy."""
+"""An arm that picks a ball and places it: its task,
+Gymnasium's checker, batches, and the scripted policy.
+"""
 
 import gymnasium as gym
 import numpy as np
@@ -21,12 +23,20 @@ def test_the_reward_grows_from_the_gripper_at_the_ball_to_the_ball_at_the_goal()
     task.begin(0, np.random.default_rng(0))
     goal, up = task.wanted(0, 0)[0], np.array([0.0, 0.0, LIFT])
     far, high = REST + [0.0, 0.0, 1.0], 0.5 * (REST + goal) + up
-    path = [(far, REST), (REST + 0.01, REST), (REST, REST), (REST + 0.5 * up, REST + 0.5 * up), (high, high)]
+    path = [
+        (far, REST),
+        (REST + 0.01, REST),
+        (REST, REST),
+        (REST + 0.5 * up, REST + 0.5 * up),
+        (high, high),
+    ]
     rewards = []
     for places in [*path, (goal, goal), (goal + up, goal)]:
         points = np.concatenate(places)[None]
         rewards.append(task.reward(points, number)[0])
-        np.testing.assert_allclose(task.size * task.observed(points, number)[0, 3:6], goal - places[1])
+        np.testing.assert_allclose(
+            task.size * task.observed(points, number)[0, 3:6], goal - places[1]
+        )
     assert (np.diff(rewards[:-1]) > 0.0).all()
     np.testing.assert_allclose([rewards[0], rewards[2], *rewards[-2:]], [0.0, 1.0 / 3.0, 1.0, 1.0])
     assert task.errors_mm(points, number) == 0.0
@@ -51,7 +61,11 @@ def test_goals_lie_on_the_table_to_either_side():
 @pytest.mark.usefixtures("can_draw")
 def test_gymnasiums_checker_passes(fingers):
     environment = gym.make(
-        "warp_resphys/PickAndPlace-v0", run=fingers, model="sysid", seconds=0.2, render_mode="rgb_array"
+        "warp_resphys/PickAndPlace-v0",
+        run=fingers,
+        model="sysid",
+        seconds=0.2,
+        render_mode="rgb_array",
     )
     check_env(environment.unwrapped)
     environment.close()
@@ -79,7 +93,8 @@ def test_the_scripted_policy_lifts_the_ball_and_puts_it_down_at_its_goal(fingers
 @pytest.mark.slow
 def test_arms_are_what_they_are_alone_and_begin_anew(fingers):
     together, alone = (
-        make_vector("pick_and_place", fingers, n, "resphys", seconds=0.3, noise=0.0, forces=True) for n in (3, 1)
+        make_vector("pick_and_place", fingers, n, "resphys", seconds=0.3, noise=0.0, forces=True)
+        for n in (3, 1)
     )
     random = np.random.default_rng(0)
     first = together.reset(seed=0)[0]
@@ -95,8 +110,17 @@ def test_arms_are_what_they_are_alone_and_begin_anew(fingers):
 
 @pytest.mark.slow
 def test_what_cannot_pick_is_refused(fingers, folder, monkeypatch):
-    refuses(InputError, "contact, which reduced models lack", make_vector, "pick_and_place", fingers, world="reduced")
+    refuses(
+        InputError,
+        "contact, which reduced models lack",
+        make_vector,
+        "pick_and_place",
+        fingers,
+        world="reduced",
+    )
     refuses(InputError, "this robot has front, left, right", make_vector, "pick_and_place", folder)
     refuses(InputError, "choose pick_and_place", ScriptedPlace, make_vector("grasp", fingers, 1))
     monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
-    refuses(InputError, r"pip install 'warp-resphys\[mujoco\]'", make_vector, "pick_and_place", fingers)
+    refuses(
+        InputError, r"pip install 'warp-resphys\[mujoco\]'", make_vector, "pick_and_place", fingers
+    )

@@ -27,7 +27,9 @@ class TestScriptedPolicy:
             return reach.actions[distances.argmin(axis=1)].astype(np.float32)
 
         still = lambda seen: -np.ones((len(seen), 3), dtype=np.float32)  # noqa: E731
-        errors, best, idle = (errors_mm(robots, policy, seed=1) for policy in (ScriptedPolicy(robots), exact, still))
+        errors, best, idle = (
+            errors_mm(robots, policy, seed=1) for policy in (ScriptedPolicy(robots), exact, still)
+        )
         assert errors.shape == (40, 3)
         assert (idle[-1] - best[-1]).min() > 10.0
         assert np.abs(errors - best).max() < 0.1 * idle.max()
@@ -39,7 +41,10 @@ class TestLearning:
         pytest.importorskip("stable_baselines3")
         from warp_resphys.environments.stable_baselines import Robots
 
-        two = [make_vector("reach", folder, 2, seconds=0.2, autoreset_mode="SameStep") for _ in range(2)]
+        two = [
+            make_vector("reach", folder, 2, seconds=0.2, autoreset_mode="SameStep")
+            for _ in range(2)
+        ]
         robots = Robots(two[0])
         robots.seed(4)
         np.testing.assert_array_equal(robots.reset(), two[1].reset(seed=4)[0])
@@ -60,7 +65,13 @@ class TestLearning:
             learned = learn(robots, 64, seed=3, on_progress=done.append)
             assert learned.num_timesteps == 64
             policy = acting(learned)
-            actions.append(policy(np.linspace(-1.0, 1.0, 4 * robots.single_observation_space.shape[0]).reshape(4, -1)))
+            actions.append(
+                policy(
+                    np.linspace(-1.0, 1.0, 4 * robots.single_observation_space.shape[0]).reshape(
+                        4, -1
+                    )
+                )
+            )
         np.testing.assert_array_equal(*actions)
         assert actions[0].shape == (4, 3)
         assert sum(done) == 128
@@ -84,7 +95,9 @@ def test_the_command_learns_and_tries_once(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(reduction, "ReductionSettings", lambda: few)
 
     def commanded(steps, seeds):
-        code, _, err = outcome(*arguments, f"steps={steps}", f"seeds={seeds}", "episodes=2", "hydra.run.dir=here")
+        code, _, err = outcome(
+            *arguments, f"steps={steps}", f"seeds={seeds}", "episodes=2", "hydra.run.dir=here"
+        )
         assert code == 0, err
         tries = len(tried)
         tried.clear()
@@ -94,13 +107,18 @@ def test_the_command_learns_and_tries_once(folder, tmp_path, monkeypatch):
     first, tries, made = commanded(64, [0])
     scripted = [f"scripted, sysid, place {number}" for number in (1, 2, 3)]
     assert list(first) == [*scripted, "PPO, sysid, seed 0"]
-    assert all(worlds[name]["mean_mm"] > 0.0 for worlds in first.values() for name in ("reduced sysid", "laboratory"))
+    assert all(
+        worlds[name]["mean_mm"] > 0.0
+        for worlds in first.values()
+        for name in ("reduced sysid", "laboratory")
+    )
     assert len({worlds["laboratory"]["mean_mm"] for worlds in first.values()}) > 1
     assert tries == 8
 
     trials = place / "reach_trials.json"
     kept = json.loads(trials.read_text())
-    del kept["PPO, sysid, seed 0"]["reduced sysid"]  # As if it had been interrupted before that trial.
+    # As if it had been interrupted before that trial.
+    del kept["PPO, sysid, seed 0"]["reduced sysid"]
     trials.write_text(json.dumps(kept))
     second, tries, again = commanded(64, [0])
     assert (second, tries, again) == (first, 1, made)
@@ -115,7 +133,11 @@ def test_the_command_learns_and_tries_once(folder, tmp_path, monkeypatch):
 
 
 def test_policies_of_several_seeds_are_told_in_one_row():
-    alike = [{"mean_mm": 2.0, "failed": 0}, {"mean_mm": None, "failed": 2}, {"mean_mm": 4.0, "failed": 1}]
+    alike = [
+        {"mean_mm": 2.0, "failed": 0},
+        {"mean_mm": None, "failed": 2},
+        {"mean_mm": 4.0, "failed": 1},
+    ]
     assert _text(alike[:1]) == "2.00"
     assert _text(alike[1:2]) == "- (2 failed)"
     assert _text(alike) == "3.00 (2.00 to 4.00) (3 failed)"

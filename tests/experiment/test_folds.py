@@ -1,4 +1,6 @@
-"""Parts of work, which are kept whatever fails or is interrupted: folds of a cross-validation, trials of a stage."""
+"""Parts of work, which are kept whatever fails or is interrupted:
+folds of a cross-validation, trials of a stage.
+"""
 
 import json
 import os
@@ -26,7 +28,10 @@ def write(context):
 def stages(name, fails, workers):
     del workers
     first = Stage("first", write, ("first.json",), {"name": name, "fails": False})
-    return [first, Stage("second", write, ("second.json",), {"name": name, "fails": fails}, ("first",))]
+    return [
+        first,
+        Stage("second", write, ("second.json",), {"name": name, "fails": fails}, ("first",)),
+    ]
 
 
 def made(folder, names="abcd", fails=""):
@@ -34,22 +39,30 @@ def made(folder, names="abcd", fails=""):
 
 
 def written(folder, name="second"):
-    return {path.parent.name[-1]: json.loads(path.read_text()) for path in Path(folder).glob(f"fold_*/{name}.json")}
+    return {
+        path.parent.name[-1]: json.loads(path.read_text())
+        for path in Path(folder).glob(f"fold_*/{name}.json")
+    }
 
 
 @pytest.mark.parametrize("processes", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_every_fold_is_run_once(tmp_path, processes):
     run_folds(made(tmp_path), Workers(processes))
     results = written(tmp_path)
-    assert {name: fold["name"] for name, fold in results.items()} == dict(zip("abcd", "abcd", strict=True))
+    assert {name: fold["name"] for name, fold in results.items()} == dict(
+        zip("abcd", "abcd", strict=True)
+    )
     others = {fold["process"] for fold in results.values()} - {os.getpid()}
-    assert len(others) in ((1, 2) if processes > 1 else (0,))  # One may do all while the other one still starts.
+    # One may do all while the other one still starts.
+    assert len(others) in ((1, 2) if processes > 1 else (0,))
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")}
     run_folds(made(tmp_path), Workers(processes))
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")} == before
 
 
-def test_a_fold_that_fails_or_is_interrupted_is_named_and_what_is_done_is_kept(tmp_path, monkeypatch):
+def test_a_fold_that_fails_or_is_interrupted_is_named_and_what_is_done_is_kept(
+    tmp_path, monkeypatch
+):
     """The workers are replaced by this process."""
 
     def one_after_another(function, tasks, workers, folder, finished):
@@ -68,7 +81,9 @@ def test_a_fold_that_fails_or_is_interrupted_is_named_and_what_is_done_is_kept(t
     assert (written(tmp_path).keys(), written(tmp_path, "first").keys()) == ({"a"}, {"a", "b"})
     first = (tmp_path / "fold_b" / "first.json").stat().st_mtime_ns
     monkeypatch.setattr(module, "fan_out", interrupted)
-    with pytest.raises(StageInterrupted, match=r"^interrupted before the folds c, d ended; .* the same command"):
+    with pytest.raises(
+        StageInterrupted, match=r"^interrupted before the folds c, d ended; .* the same command"
+    ):
         run_folds(made(tmp_path), Workers(2))
     assert written(tmp_path).keys() == {"a", "b"}
     assert (tmp_path / "fold_b" / "first.json").stat().st_mtime_ns == first

@@ -1,4 +1,7 @@
-"""Recordings of a body, real or simulated, become markers in its frame; what cannot is refused by file and marker."""
+"""Recordings of a body, real or simulated, become markers in its frame.
+
+What cannot is refused by file and marker.
+"""
 
 import copy
 import re
@@ -58,10 +61,16 @@ def laboratory(tmp_path_factory):
 
 
 def true_markers(played, setup, dataset, times):
-    """(R, T, M, 3) tracked markers in the frame of the body at times (R, T) since the release, as simulated [m]."""
+    """(R, T, M, 3) tracked markers in the frame of the body
+    at times (R, T) since the release, as simulated [m].
+    """
     simulator = laboratory_simulator(played, setup.gravity)
-    read = bound_markers(played.binding, simulator.body.mesh, setup.tracked, TIPS).to(simulator.rest_positions)
-    motions = TrialBatch.of(dataset, dataset.names, simulator.body, played.payload_at, simulator.time_step)
+    read = bound_markers(played.binding, simulator.body.mesh, setup.tracked, TIPS).to(
+        simulator.rest_positions
+    )
+    motions = TrialBatch.of(
+        dataset, dataset.names, simulator.body, played.payload_at, simulator.time_step
+    )
     motions = replace(motions, times=torch.as_tensor(times).clamp_min(0.0))
     start = Start(simulator.rest_state(len(times)), torch.zeros(len(times), dtype=torch.float64))
     with torch.no_grad():
@@ -82,7 +91,9 @@ def test_simulated_markers_come_back_within_noise(laboratory):
     played = StageSettings.reading(run, *PLAYED)
     setup = make_setup(played)
     released = np.array(list(read_json(folder / TRUTH)["released_s"].values()))
-    results = np.array([trial["release_frame"] for trial in read_json(folder / QUALITY).values()]) / RATE
+    results = (
+        np.array([trial["release_frame"] for trial in read_json(folder / QUALITY).values()]) / RATE
+    )
     times = motions.times.numpy() + (results - released)[:, None]
     true = true_markers(played, setup, dataset, times)
     # The nominal places turn the frame by a little; what has to come back is the motion in it.
@@ -92,15 +103,21 @@ def test_simulated_markers_come_back_within_noise(laboratory):
     off = (motions.observed.numpy() - bound - moved)[motions.seen.numpy()]
     assert float(motions.amplitude[2]) > 0.01
     assert np.sqrt(np.mean(off**2)) < 2.5 * run.laboratory.noise
-    torch.testing.assert_close(motions.held, torch.as_tensor(bound).expand(3, -1, -1), rtol=0.0, atol=1e-12)
+    torch.testing.assert_close(
+        motions.held, torch.as_tensor(bound).expand(3, -1, -1), rtol=0.0, atol=1e-12
+    )
     registration = read_json(folder / REGISTRATION)["m50"]
-    assert 0.2 < registration["rms_mm"] < 0.6  # misplaced by 0.3 mm a coordinate, less what the motion takes up
+    # Misplaced by 0.3 mm a coordinate, less what the motion takes up.
+    assert 0.2 < registration["rms_mm"] < 0.6
     assert max(abs(x) for shift in registration["shift_mm"].values() for x in shift) < 0.1
 
 
 def test_what_binds_markers_makes_recordings_anew_and_a_changed_one_is_imported_again(shelf):
     changes = ("markers.bind=patch", "markers.patch=0.05", "markers.largest_distance=0.03")
-    made = [acquisition_stages(settings("experiment=beam_real", *SMALL, *changes[:count]))[0] for count in range(4)]
+    made = [
+        acquisition_stages(settings("experiment=beam_real", *SMALL, *changes[:count]))[0]
+        for count in range(4)
+    ]
     assert len({fingerprint(stage, {}) for stage in made}) == 4
     assert made[2].settings.binding.patch == 0.05
     before = fingerprint(acquisition_stages(parse(RunSettings, shelf.config))[0], {})
@@ -131,7 +148,9 @@ def test_a_trial_does_not_depend_on_the_others(tmp_path, laboratory):
     one, other = (read_recording(place / "recordings/m90.h5") for place in (folder, tmp_path))
     np.testing.assert_allclose(one.positions, other.positions, rtol=0.0, atol=1e-7)
     again = settings("experiment=beam_real", *SMALL, "seed=1")
-    assert fingerprint(acquisition_stages(again)[0], {}) != fingerprint(acquisition_stages(run)[0], {})
+    assert fingerprint(acquisition_stages(again)[0], {}) != fingerprint(
+        acquisition_stages(run)[0], {}
+    )
     one, other = (make_setup(StageSettings.reading(own, *PLAYED)) for own in (again, run))
     assert np.abs(one.frame.translation - other.frame.translation).min() > 1e-3
 
@@ -146,15 +165,25 @@ class Shelf:
         hung = self.config["laboratory"]["trials"]
         self.config["data"] |= {
             "folder": str(folder),
-            "trials": {name: {"file": f"{name}.h5", "payload": hung[of]["payload"]} for name, of in names.items()},
+            "trials": {
+                name: {"file": f"{name}.h5", "payload": hung[of]["payload"]}
+                for name, of in names.items()
+            },
         }
-        self.recordings = {name: read_recording(made / f"recordings/{of}.h5") for name, of in names.items()}
+        self.recordings = {
+            name: read_recording(made / f"recordings/{of}.h5") for name, of in names.items()
+        }
         for name in names:
             self.write(name)
 
     def write(self, name, **changes):
         recording = self.recordings[name]
-        fields = {"labels": recording.labels, "positions": recording.positions, "rate": recording.rate, **changes}
+        fields = {
+            "labels": recording.labels,
+            "positions": recording.positions,
+            "rate": recording.rate,
+            **changes,
+        }
         path = self.folder / f"{name}.h5"
         write_recording(path, Recording(source=path, **fields))
 
@@ -197,7 +226,9 @@ def test_a_trial_that_is_tested_does_not_say_where_markers_sit(shelf):
 
 
 def test_a_trial_with_markers_of_its_own(shelf):
-    """In one trial a marker sits elsewhere, and has another name: it is bound by that trial, and nowhere else there."""
+    """In one trial a marker sits elsewhere, and has another name:
+    it is bound by that trial, and nowhere else there.
+    """
     whole = shelf.bring_in()
     away = np.array([0.0, 0.003, 0.0])
     shelf.move("load101", "Tip - 2", away)
@@ -208,11 +239,15 @@ def test_a_trial_with_markers_of_its_own(shelf):
     check(shelf.config)
     wrong = copy.deepcopy(shelf.config)
     wrong["data"]["trials"]["load52"]["labels"] = ["a", "b", "c", *BASES]
-    refuses(InputError, r"load52\.labels names 'a', .* none of which is in markers\.trac", check, wrong)
+    refuses(
+        InputError, r"load52\.labels names 'a', .* none of which is in markers\.trac", check, wrong
+    )
     shelf.learned = ["bare", "load52"]
     results = shelf.bring_in()
     assert list(results["labels"]) == [*TIPS, "Tip - 4"]
-    np.testing.assert_array_equal(np.isfinite(results["held"]).all(2), [[1, 1, 1, 0], [1, 1, 1, 0], [1, 0, 1, 1]])
+    np.testing.assert_array_equal(
+        np.isfinite(results["held"]).all(2), [[1, 1, 1, 0], [1, 1, 1, 0], [1, 0, 1, 1]]
+    )
     hidden = np.isnan(results["observed"]).all((1, 3))
     np.testing.assert_array_equal(hidden, ~np.isfinite(results["held"]).all(2))
     np.testing.assert_allclose(results["bound"][:3], whole["bound"], rtol=0.0, atol=2e-4)
@@ -221,11 +256,16 @@ def test_a_trial_with_markers_of_its_own(shelf):
     # That trial has a say where it is learned from, and none on markers that it does not have.
     assert np.abs(mean[[0, 2]] - results["bound"][[0, 2]]).max() > 1e-5
     np.testing.assert_array_equal(mean[[1, 3]], results["bound"][[1, 3]])
-    apart = np.linalg.norm(results["bound"][3] - results["bound"][1])  # ``away`` is in the frame of the recording
+    # ``away`` is in the frame of the recording
+    apart = np.linalg.norm(results["bound"][3] - results["bound"][1])
     assert apart == pytest.approx(np.linalg.norm(away), abs=2e-4)
     swing, same = (data["observed"][2] - data["held"][2] for data in (results, whole))
     np.testing.assert_allclose(swing[:, [0, 3, 2]], same, rtol=0.0, atol=5e-5)
-    assert set(read_json(shelf.folder / REGISTRATION)["load101"]["shift_mm"]) == {"Tip - 1", "Tip - 3", "Tip - 4"}
+    assert set(read_json(shelf.folder / REGISTRATION)["load101"]["shift_mm"]) == {
+        "Tip - 1",
+        "Tip - 3",
+        "Tip - 4",
+    }
     assert Trials.read(shelf.folder / DATASET).sets == ((0, 2, 3), (0, 1, 2))
 
 
@@ -233,18 +273,30 @@ def test_recordings_that_begin_with_the_release_of_a_deformed_body(shelf):
     """As the published ones do: a loaded beam at rest, whose weight is cut off."""
     whole = shelf.bring_in()
     for name, recording in shelf.recordings.items():
-        shelf.write(name, positions=recording.positions[44:], rest=np.median(recording.positions[:40], axis=0))
+        shelf.write(
+            name,
+            positions=recording.positions[44:],
+            rest=np.median(recording.positions[:40], axis=0),
+        )
     shelf.config["data"] |= {"begins": "released", "rest": "file", "seconds": 0.4}
     shelf.config["release"]["sideways"] = 0.0
     results = shelf.bring_in()
     np.testing.assert_allclose(results["bound"], whole["bound"], rtol=0.0, atol=2e-5)
     np.testing.assert_allclose(results["held"], results["observed"][:, 0], rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(results["times"], np.broadcast_to(np.arange(41) / RATE, (3, 41)), atol=1e-9)
-    np.testing.assert_allclose(results["observed"][2], whole["observed"][2, 3:44], rtol=0.0, atol=5e-5)
+    np.testing.assert_allclose(
+        results["times"], np.broadcast_to(np.arange(41) / RATE, (3, 41)), atol=1e-9
+    )
+    np.testing.assert_allclose(
+        results["observed"][2], whole["observed"][2, 3:44], rtol=0.0, atol=5e-5
+    )
     assert np.linalg.norm(results["held"] - results["bound"], axis=2).min() > 5e-4
     rest = np.median(shelf.recordings["load52"].positions[:40], axis=0)
     shelf.write("load52", positions=still(shelf, 5e-5), rest=rest)
-    refuse(shelf, r"load52\.h5: 'Tip - 1', .* never move by more than 0\.\d\d mm in the 0\.41 s that are read")
+    refuse(
+        shelf,
+        r"load52\.h5: 'Tip - 1', .* never move by more than 0\.\d\d mm "
+        r"in the 0\.41 s that are read",
+    )
 
 
 def refuse(shelf, message, error=DataFileError):
@@ -275,16 +327,28 @@ def still(shelf, noise):
         (hide("Tip - 2", slice(None)), ".*Tip - 2.* seen"),
         (hide("Base - 3", slice(None)), ".*Base - 3.* seen"),
         (hide("Tip - 2", slice(None, 45)), "'Tip - 2' cannot be seen while the body is held"),
-        (hide("Tip - 2", slice(41, None)), r"'Tip - 2' cannot be seen in the 0\.5 s after the release"),
+        (
+            hide("Tip - 2", slice(41, None)),
+            r"'Tip - 2' cannot be seen in the 0\.5 s after the release",
+        ),
         (
             lambda shelf: shelf.move("load52", "Base - 3", [0.002, 0.0, 0.0]),
             r"base marker Base - \d moved by \d\.\d\d mm against .* since .*bare\.h5",
         ),
-        (lambda shelf: shelf.write("load52", positions=still(shelf, 1e-5)), "never moves by more than"),
-        (give(actuation=np.zeros((101, 2))), "holds an actuation, 2 in each frame, which nothing here uses"),
+        (
+            lambda shelf: shelf.write("load52", positions=still(shelf, 1e-5)),
+            "never moves by more than",
+        ),
+        (
+            give(actuation=np.zeros((101, 2))),
+            "holds an actuation, 2 in each frame, which nothing here uses",
+        ),
         (give(rate=25.0), "has 25 frames per second, too few .* record at least 40"),
         (
-            lambda shelf: (shelf.config["data"].update(rest="file"), shelf.config["release"].update(sideways=0.0)),
+            lambda shelf: (
+                shelf.config["data"].update(rest="file"),
+                shelf.config["release"].update(sideways=0.0),
+            ),
             r"has no array 'rest' .* or set data\.rest to held",
         ),
     ],
@@ -297,13 +361,17 @@ def test_a_recording_that_cannot_be_used_is_named(shelf, wrong, message):
 def test_a_missing_file_is_named(shelf):
     (shelf.folder / "load52.h5").unlink()
     refuse(shelf, r"load52\.h5 does not exist")
-    with pytest.raises(DataFileError, match=r"cannot read .*load52\.h5 .*data\.trials\.load52\.file"):
+    with pytest.raises(
+        DataFileError, match=r"cannot read .*load52\.h5 .*data\.trials\.load52\.file"
+    ):
         acquisition_stages(parse(RunSettings, shelf.config))
 
 
 def test_a_base_that_moved_as_a_whole_is_named(shelf):
     shelf.write("load101", positions=shelf.recordings["load101"].positions + [0.02, 0.0, 0.0])
-    refuse(shelf, r"load101\.h5: base marker Base - \d stands 20\.\d\d mm from its place in .*bare\.h5")
+    refuse(
+        shelf, r"load101\.h5: base marker Base - \d stands 20\.\d\d mm from its place in .*bare\.h5"
+    )
     shelf.config["markers"]["largest_shift"] = None
     shelf.bring_in()
     shelf.move("load101", "Base - 3", [0.002, 0.0, 0.0])
@@ -313,22 +381,34 @@ def test_a_base_that_moved_as_a_whole_is_named(shelf):
 
 
 def test_chosen_markers_register(shelf):
-    shelf.config["markers"]["reference"] = {"Base - 1": shelf.config["markers"]["reference"]["Base - 1"]}
+    shelf.config["markers"]["reference"] = {
+        "Base - 1": shelf.config["markers"]["reference"]["Base - 1"]
+    }
     whole = shelf.bring_in()
     for name in shelf.recordings:
         shelf.move(name, "Tip - 3", [0.0, 0.0, 0.012])
-    refuse(shelf, r"bare\.h5: the markers at rest do not fit .* 4\.0 mm: 'Tip - 3' is \d+\.\d mm off")
+    refuse(
+        shelf, r"bare\.h5: the markers at rest do not fit .* 4\.0 mm: 'Tip - 3' is \d+\.\d mm off"
+    )
     shelf.config["markers"]["register_with"] = ["Base - 1", "Tip - 1", "Tip - 2"]
     off = np.linalg.norm(shelf.bring_in()["bound"] - whole["bound"], axis=1)
     assert off[:2].max() < 2e-3
     assert off[2] == pytest.approx(0.012, abs=2e-3)
     shelf.config["markers"]["register_with"] = ["Base - 1", "Base - 2"]
-    refuses(InputError, "register_with names 'Base - 2', which is in neither tracked nor reference", shelf.bring_in)
+    refuses(
+        InputError,
+        "register_with names 'Base - 2', which is in neither tracked nor reference",
+        shelf.bring_in,
+    )
 
 
 def test_a_wrong_vertical_and_a_body_that_is_too_short_are_noticed(shelf):
     shelf.config["data"]["up"] = "-x"
-    refuse(shelf, r"bare\.h5: with data\.up .* degrees from the configured one: set data\.up", InputError)
+    refuse(
+        shelf,
+        r"bare\.h5: with data\.up .* degrees from the configured one: set data\.up",
+        InputError,
+    )
     shelf.config["data"]["up"] = "x"
     shelf.config["mesh"]["size"] = [0.06, 0.03, 0.03]
     shelf.config["data"]["payload_at"] = {"x": 0.06}
@@ -341,8 +421,12 @@ TUTORIAL = ROOT / "docs" / "bring_your_robot.md"
 
 def test_the_tutorial(shared_data, tmp_path, monkeypatch):
     """Its mesh, its configuration and its output, on the recordings that it was written with."""
-    blocks = re.findall(r"```(\w*)\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), flags=re.DOTALL)
-    (mesh,), (written,) = ([text for kind, text in blocks if kind == wanted] for wanted in ("python", "yaml"))
+    blocks = re.findall(
+        r"```(\w*)\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), flags=re.DOTALL
+    )
+    (mesh,), (written,) = (
+        [text for kind, text in blocks if kind == wanted] for wanted in ("python", "yaml")
+    )
     (log,) = [text.splitlines() for _, text in blocks if text.startswith("import: ")]
     monkeypatch.chdir(tmp_path)
     exec(compile(mesh, TUTORIAL.name, "exec"), {})
@@ -357,13 +441,19 @@ def test_the_tutorial(shared_data, tmp_path, monkeypatch):
     quality, registration = read_json(tmp_path / QUALITY), read_json(tmp_path / REGISTRATION)
     for line, (name, trial) in zip(log, quality.items(), strict=True):
         rms = registration[name]["rms_mm"]
-        assert line == f"import: {name} is released in frame {trial['release_frame']:.1f}, registered to {rms:.2f} mm"
+        assert (
+            line
+            == f"import: {name} is released in frame {trial['release_frame']:.1f}, registered to "
+            f"{rms:.2f} mm"
+        )
 
 
 def moving(*starts, jumps=()):
-    """A recording (120, M, 3) at 100 Hz of markers that move by 2 mm from their frames on, and of jumps [m].
+    """A recording (120, M, 3) at 100 Hz of markers that move
+    by 2 mm from their frames on, and of jumps [m].
 
-    A marker of whom the start is None rests. A jump is a marker, its first and last frame, and its size.
+    A marker of whom the start is None rests. A jump is a marker, its first and last frame, and its
+    size.
     """
     positions = np.random.default_rng(0).normal(scale=2e-5, size=(120, len(starts), 3))
     for marker, start in enumerate(starts):
@@ -410,18 +500,26 @@ def test_the_onset_of_the_inflated_segment_is_that_of_its_pressure(shared_data):
 
 @pytest.mark.parametrize(("ratio", "count"), [(0.25, 24), (1.0, 6)])
 def test_inputs_keep_their_time_at_steps_of_another_length(ratio, count):
-    """What a simulator with smaller steps is driven by lasts as long as it did, and so does the motion of a base."""
+    """What a simulator with smaller steps is driven by lasts as long as it did,
+    and so does the motion of a base.
+    """
     base = np.zeros((1, 7, 6))
     base[0, :, 1] = 1e-3 * np.arange(7.0)
     times, seen, weight = np.zeros((1, 7)), np.zeros((1, 7, 1, 3)), np.zeros(1)
     inputs = {"pressure": np.arange(6.0)[None, :, None]}
     words = (("a",), ("m",), ("rest",))
-    dataset = Trials(*words, times, seen, seen[:, 0], weight, np.zeros(3), 0.01, inputs=inputs, base=base)
+    dataset = Trials(
+        *words, times, seen, seen[:, 0], weight, np.zeros(3), 0.01, inputs=inputs, base=base
+    )
     body = build_body(settings("experiment=beam_real"))
     given = dataset.acting(["a"], body, None, 0.01 * ratio)[0].fields
     times = 0.01 * ratio * (np.arange(count) + 1.0)
-    np.testing.assert_allclose(given["pressure"][:, 0, 0], ((times - 0.005 * ratio) / 0.01).astype(int))
-    moved = given["fixed_positions"][:, 0] - torch.from_numpy(body.mesh.vertices[body.fixed_vertices])
+    np.testing.assert_allclose(
+        given["pressure"][:, 0, 0], ((times - 0.005 * ratio) / 0.01).astype(int)
+    )
+    moved = given["fixed_positions"][:, 0] - torch.from_numpy(
+        body.mesh.vertices[body.fixed_vertices]
+    )
     expected = np.broadcast_to(0.1 * times[:, None], moved.shape[:2])
     np.testing.assert_allclose(moved[..., 1].numpy(), expected, atol=1e-15)
 

@@ -1,4 +1,6 @@
-"""The law of a material through the command line: identified, used where it helps, and tested under other loads."""
+"""The law of a material through the command line: identified,
+used where it helps, and tested under other loads.
+"""
 
 import json
 import shutil
@@ -21,19 +23,32 @@ from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.robot.description import finished_experiment
 
 TINY = [
-    *("mesh.divisions=[4,1,1]", "data.steps=24", "data.weights_g.train=[60,140,200]", "data.weights_g.test=[160]"),
-    *("data.weights_g.validation=[100]", "trainer.epochs=40", "trainer.rollout_every=20", "network.width=32"),
+    *("mesh.divisions=[4,1,1]", "data.steps=24"),
+    *("data.weights_g.train=[60,140,200]", "data.weights_g.test=[160]"),
+    *("data.weights_g.validation=[100]", "network.width=32"),
+    *("trainer.epochs=40", "trainer.rollout_every=20"),
     *("timing=false", "law.branches=7", "law.trials=2", "law.seconds=0.2", "law.max_evaluations=6"),
-    "law.terms=[c20,c01,dilation]",  # powers of Ogden's law have kernels of their own; test_law selects them
+    # Powers of Ogden's law have kernels of their own; test_law selects them.
+    "law.terms=[c20,c01,dilation]",
     *("identify.seconds=0.2", "trainer.gate=false"),  # a tiny force is no gain
 ]
 RUBBER = ["experiment=law_rubber", *TINY, "identify.trials=2", "identify.max_evaluations=6"]
-RANGES = "{youngs_modulus:{lower:50e3,upper:1e6,logarithmic:true},poissons_ratio:{lower:0.3,upper:0.4995}}"
+RANGES = (
+    "{youngs_modulus:{lower:50e3,upper:1e6,logarithmic:true},"
+    "poissons_ratio:{lower:0.3,upper:0.4995}}"
+)
 KNOWN = [  # E and nu alone describe its target.
     *("experiment=beam_oscillation", "target.poissons_ratio=0.4", *TINY, "law.families=0"),
     f"identify={{parameters:{RANGES},max_evaluations:12,tolerance:1e-10}}",
 ]
-OTHERS = ["400 g", "120 g up", "120 g sideways", "200 g mid-span", "120 g, and 200 g sideways mid-span", "twist 90°"]
+OTHERS = [
+    "400 g",
+    "120 g up",
+    "120 g sideways",
+    "200 g mid-span",
+    "120 g, and 200 g sideways mid-span",
+    "twist 90°",
+]
 OTHERS += ["120 g at 45°"]
 
 
@@ -51,7 +66,10 @@ def rubber(tmp_path_factory, short_stride):
 
 
 def by_trial(folder):
-    return {trial["name"]: trial["errors_mm"] for trial in read_json(folder / "metrics.json")["per_trajectory"]}
+    return {
+        trial["name"]: trial["errors_mm"]
+        for trial in read_json(folder / "metrics.json")["per_trajectory"]
+    }
 
 
 @pytest.mark.slow
@@ -64,9 +82,15 @@ class TestALawThatHelps:
         along = np.cos(parameters["fibre_azimuth_1"]) * np.cos(parameters["fibre_elevation_1"])
         assert abs(along) > np.cos(np.radians(5.0))
         assert parameters["fibre_tension_1"] == pytest.approx(80e3, rel=0.3)
-        moduli = sum(value for name, value in parameters.items() if name.startswith("prony_modulus"))
+        moduli = sum(
+            value for name, value in parameters.items() if name.startswith("prony_modulus")
+        )
         assert moduli == pytest.approx(0.3 * 2.0 * 44e3, rel=0.3)
-        assert all(value >= 0.0 for name, value in parameters.items() if "azimuth" not in name and "elev" not in name)
+        assert all(
+            value >= 0.0
+            for name, value in parameters.items()
+            if "azimuth" not in name and "elev" not in name
+        )
         sizes = [len(own["groups"]) for own in law["classes"]]
         assert sizes == sorted(sizes)
         assert law["classes"][0]["groups"] == []
@@ -80,7 +104,8 @@ class TestALawThatHelps:
         assert list(trials) == ["160 g", *OTHERS]
         for name, own in trials.items():
             assert own["law"] < 0.2 * own["sysid"], name
-        assert trials["twist 90°"]["resphys"] == trials["twist 90°"]["law"]  # far from the training of the force
+        # Far from the training of the force.
+        assert trials["twist 90°"]["resphys"] == trials["twist 90°"]["law"]
         assert trials["160 g"]["resphys"] != trials["160 g"]["law"]
         assert finished_experiment(rubber).sources("resphys") == (LAW, LAW)
 
@@ -94,7 +119,9 @@ class TestALawThatHelps:
         law = read_json(folder / "law.json")
         assert law["parameters"] == given["parameters"]
         assert law["accepted"]
-        assert by_trial(folder)["twist 90°"]["law"] == pytest.approx(by_trial(rubber)["twist 90°"]["law"], rel=0.01)
+        assert by_trial(folder)["twist 90°"]["law"] == pytest.approx(
+            by_trial(rubber)["twist 90°"]["law"], rel=0.01
+        )
         with pytest.raises(DataFileError, match=r"errors\.json is not a law of this version"):
             check(composed("experiment=beam_oscillation", f"law={rubber / 'errors.json'}"))
 
@@ -118,7 +145,9 @@ def test_a_law_that_does_not_help_is_not_used(tmp_path, short_stride):
 
 @pytest.mark.slow
 def test_the_demo_corrects_within_and_beyond_its_training_loads(tmp_path):
-    """Law, force and what has no simulator, under a weight between those of the training and in a twist [mm]."""
+    """Law, force and what has no simulator, under a weight
+    between those of the training and in a twist [mm].
+    """
     errors = by_trial(run_without_report(tmp_path, "budget=quick"))
     within, beyond = errors["70 g"], errors["twist 90°"]
     for own, law, force in ((within, 2.4e-4, 2.2e-5), (beyond, 4.3e-4, 3.5e-4)):
@@ -149,12 +178,16 @@ def test_weights_in_their_directions_at_their_places_hold_the_beam():
     for row, places in enumerate(held.values()):
         for x, weight in places.items():
             face = select_vertices(simulator.body.mesh, x=x)
-            force[row, face] += force.new_tensor(weight) * float(np.linalg.norm(simulator.gravity)) / len(face)
+            force[row, face] += (
+                force.new_tensor(weight) * float(np.linalg.norm(simulator.gravity)) / len(face)
+            )
     with torch.no_grad():
         state = initial_state(simulator, run.data, [all_trials(run)[name] for name in held])
         assert not state.v.any()
         still = State(state.q, torch.zeros_like(state.q))
-        balanced, released = (simulator.step(still, inputs).q for inputs in (Inputs(force), Inputs()))
+        balanced, released = (
+            simulator.step(still, inputs).q for inputs in (Inputs(force), Inputs())
+        )
     moved = (released - state.q).abs().amax((1, 2))
     assert float(moved.min()) > 1e-4
     assert ((balanced - state.q).abs().amax((1, 2)) < 1e-4 * moved).all()

@@ -1,4 +1,6 @@
-"""The main job through its command line: `warp-resphys` with a small beam, a few steps and a few epochs."""
+"""The main job through its command line: `warp-resphys` with a small beam,
+a few steps and a few epochs.
+"""
 
 import json
 import os
@@ -38,16 +40,64 @@ class TestCompleteRun:
     def test_files_metrics_and_a_correction_that_corrects(self, finished):
         names = set(finished[1]) - {f"stages/{name}.json" for name in main_job.STAGES}
         names = {name for name in names if not name.startswith("figures/")}
-        learned = {f"{kind}{model}.{end}" for model in ("resphys", "simfree") for kind, end in LEARNED_FILES}
-        data = {"dataset.h5", "reconstruction_resphys.h5", "reconstruction.json", "rollouts.h5", "times.json"}
-        assert names == data | learned | {"errors.json", "metrics.json", "report.html", "stages.json"}
+        learned = {
+            f"{kind}{model}.{end}"
+            for model in ("resphys", "simfree")
+            for kind, end in LEARNED_FILES
+        }
+        data = {
+            "dataset.h5",
+            "reconstruction_resphys.h5",
+            "reconstruction.json",
+            "rollouts.h5",
+            "times.json",
+        }
+        assert names == data | learned | {
+            "errors.json",
+            "metrics.json",
+            "report.html",
+            "stages.json",
+        }
         results = metrics(finished[0])
-        keys = {"errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "range", "networks", "parameters"}
-        keys |= {"reconstruction", "seconds_per_test_trajectory", "seconds", "peak_memory_gib", "versions", "device"}
-        assert set(results) == keys | {"first_guesses", "at_bounds", "baselines", "beyond", "recommended"}
-        assert set(results["seconds_per_test_trajectory"]) == {"simulation", "target", "resphys", "inference"}
-        assert set(results["errors_mm"]) == {*BASELINES, "simulation", "reconstruction", "resphys", "simfree"}
-        assert set(results["errors_vs_reconstruction_mm"]) == set(results["errors_mm"]) - {"reconstruction"}
+        keys = {
+            "errors_mm",
+            "errors_vs_reconstruction_mm",
+            "per_trajectory",
+            "range",
+            "networks",
+            "parameters",
+        }
+        keys |= {
+            "reconstruction",
+            "seconds_per_test_trajectory",
+            "seconds",
+            "peak_memory_gib",
+            "versions",
+            "device",
+        }
+        assert set(results) == keys | {
+            "first_guesses",
+            "at_bounds",
+            "baselines",
+            "beyond",
+            "recommended",
+        }
+        assert set(results["seconds_per_test_trajectory"]) == {
+            "simulation",
+            "target",
+            "resphys",
+            "inference",
+        }
+        assert set(results["errors_mm"]) == {
+            *BASELINES,
+            "simulation",
+            "reconstruction",
+            "resphys",
+            "simfree",
+        }
+        assert set(results["errors_vs_reconstruction_mm"]) == set(results["errors_mm"]) - {
+            "reconstruction"
+        }
         assert results["baselines"].keys() == {*BASELINES}
         assert list(results["seconds"]) == main_job.STAGES
         assert 0.1 < results["peak_memory_gib"] < 4.0
@@ -67,7 +117,10 @@ class TestCompleteRun:
             assert file["observed"].shape == (6, 13, 45, 3)
             assert file["observed"].attrs["units"] == "m"
         with read_hdf5(finished[0] / "rollouts.h5", "rollouts") as file:
-            stored = {model: file[f"{model}_observed"][:, 1:] for model in ("simulation", "resphys", "simfree")}
+            stored = {
+                model: file[f"{model}_observed"][:, 1:]
+                for model in ("simulation", "resphys", "simfree")
+            }
         with read_hdf5(finished[0] / "reconstruction_resphys.h5", "reconstruction") as file:
             stored["reconstruction"] = file["q"][4:, 1:]
             assert not file["force"][:, 0].any()
@@ -75,19 +128,27 @@ class TestCompleteRun:
         for model, q in stored.items():
             distances = 1e3 * np.linalg.norm(q - target, axis=-1).mean(-1)
             summary = results["errors_mm"][model]
-            np.testing.assert_allclose([summary["mean"], summary["std"]], [distances.mean(), distances.std()])
+            np.testing.assert_allclose(
+                [summary["mean"], summary["std"]], [distances.mean(), distances.std()]
+            )
         against = 1e3 * np.linalg.norm(stored["resphys"] - stored["reconstruction"], axis=-1).mean()
-        np.testing.assert_allclose(results["errors_vs_reconstruction_mm"]["resphys"]["mean"], against)
+        np.testing.assert_allclose(
+            results["errors_vs_reconstruction_mm"]["resphys"]["mean"], against
+        )
 
     def test_settings_and_seeds_are_saved(self, finished):
-        record = json.loads((finished[0] / "stages" / "train_resphys.json").read_text())["settings"]["training"]
+        record = json.loads((finished[0] / "stages" / "train_resphys.json").read_text())[
+            "settings"
+        ]["training"]
         assert (record["seed"], record["trainer"]["epochs"]) == (0, 40)
         saved = OmegaConf.load(finished[0] / ".hydra" / "config.yaml")
         assert saved.network.width == 32
         training = json.loads((finished[0] / "training_resphys.json").read_text())
         history, kept = training["epochs"], training["kept"]
         assert [r["epoch"] for r in history if "rollout_error_mm" in r] == [10, 20, 30, 40]
-        assert kept["validation_rollout_error_mm"] == min(r.get("rollout_error_mm", 1e9) for r in history)
+        assert kept["validation_rollout_error_mm"] == min(
+            r.get("rollout_error_mm", 1e9) for r in history
+        )
         assert history[kept["epoch"] - 1]["rollout_error_mm"] == kept["validation_rollout_error_mm"]
         _, metadata = read_checkpoint(finished[0] / "resphys.safetensors", "residual force")
         assert metadata.items() >= kept.items()
@@ -99,7 +160,9 @@ class TestCompleteRun:
         refused = replace(learned, test={**learned.test, "used": False})
         monkeypatch.setattr(Learned, "read", lambda *_: refused)
         assert experiment.model("resphys").learned is None
-        monkeypatch.setattr(Learned, "read", lambda *_: replace(refused, network=NextState.__new__(NextState)))
+        monkeypatch.setattr(
+            Learned, "read", lambda *_: replace(refused, network=NextState.__new__(NextState))
+        )
         assert experiment.learned("simfree") is not None
 
     def test_the_second_call_runs_nothing(self, finished):
@@ -178,14 +241,21 @@ class TestOtherRuns:
             ["mesh=beam_tetrahedra", "mesh.divisions=[2,1,1]", *main_job.SHORT],
             ["physics=published", *TINY, "trainer=published", "trainer.learning_rate=1e-2"],
             ["solver=projective_dynamics", *TINY, "data.steps=4"],
-            ["integrator=midpoint", "target.model=stable_neo_hookean", "target.stiffness_damping=1e-3", *TINY],
+            [
+                "integrator=midpoint",
+                "target.model=stable_neo_hookean",
+                "target.stiffness_damping=1e-3",
+                *TINY,
+            ],
         ],
         ids=lambda options: options[0],
     )
     def test_other_options_run_and_the_correction_corrects(self, folder, options):
         check_correction(*options)
 
-    def test_each_frame_of_lbfgsb_starts_from_the_force_of_the_one_before(self, folder, monkeypatch):
+    def test_each_frame_of_lbfgsb_starts_from_the_force_of_the_one_before(
+        self, folder, monkeypatch
+    ):
         guesses, step = [], LBFGSB.step
 
         def recorded(self, state, observed, inputs=None, first_guess=None, read=None):
@@ -208,8 +278,16 @@ class TestOtherRuns:
     def test_the_same_seed_gives_the_same_numbers_in_another_process(self, finished, folder):
         """Of two threads and another order of sets."""
         places = os.pathsep.join(place for place in sys.path if place)
-        environment = {**os.environ, "PYTHONHASHSEED": "2", "OMP_NUM_THREADS": "2", "PYTHONPATH": places}
-        program = "import sys; from support.main_job import run_without_report as run; run('.', *sys.argv[1:])"
+        environment = {
+            **os.environ,
+            "PYTHONHASHSEED": "2",
+            "OMP_NUM_THREADS": "2",
+            "PYTHONPATH": places,
+        }
+        program = (
+            "import sys; from support.main_job import run_without_report as run; "
+            "run('.', *sys.argv[1:])"
+        )
         command = [sys.executable, "-c", program, *TINY]
         subprocess.run(command, env=environment, check=True, capture_output=True, timeout=300)
         same_errors(errors(), errors(finished[0]))
@@ -237,10 +315,15 @@ GROUPS = ("physics", "solver", "reconstruction", "network", "trainer")
 
 
 def choices():
-    """Every mesh alone, and choices of all other groups at once, which have each option at least once."""
+    """Every mesh alone, and choices of all other groups at once,
+    which have each option at least once.
+    """
     for option in options("mesh"):
         yield [f"mesh={option}"]
-    others = {group: [option for option in options(group) if option not in FROM_MARKERS] for group in GROUPS}
+    others = {
+        group: [option for option in options(group) if option not in FROM_MARKERS]
+        for group in GROUPS
+    }
     for row in range(max(len(names) for names in others.values())):
         yield [f"{group}={names[row % len(names)]}" for group, names in others.items()]
 
@@ -257,7 +340,10 @@ class TestConfiguration:
         more = {"mesh=surface": ["mesh.path=box.obj", "mesh.units=m"]}
         more |= {f"mesh={kind}": ["mesh.path=box.vtu"] for kind in ("file", "arm_published")}
         run = settings(*chosen, *more.get(choice, []))
-        if choice.startswith(("mesh=arm", "mesh=rod", "mesh=segment")) and choice != "mesh=arm_published":
+        if (
+            choice.startswith(("mesh=arm", "mesh=rod", "mesh=segment"))
+            and choice != "mesh=arm_published"
+        ):
             assert build_mesh(run.mesh).cells.shape[1] in (4, 8, 10, 20, 27)
         else:
             check_run(run)
@@ -265,7 +351,9 @@ class TestConfiguration:
     def test_published_sizes_and_settings(self):
         run = settings("physics=published", "network=published", "trainer=published")
         assert build_simulator(run, run.simulation).body.n_vertices * 3 == 528
-        assert [len(getattr(run.data.weights_g, name)) for name in ("train", "validation", "test")] == [9, 2, 5]
+        assert [
+            len(getattr(run.data.weights_g, name)) for name in ("train", "validation", "test")
+        ] == [9, 2, 5]
         assert run.data.steps == 150
         assert (run.network.blocks, run.network.layers, run.network.width) == (5, 3, 512)
         trainer = run.trainer
@@ -281,7 +369,9 @@ class TestConfiguration:
 class TestInterruption:
     @pytest.fixture
     def interruption(self, monkeypatch):
-        """Counts frames and epochs by the stage, and sends a signal to this process at a chosen one."""
+        """Counts frames and epochs by the stage, and sends a signal
+        to this process at a chosen one.
+        """
         done, cut, advance = Counter(), {}, Progress.advance
         before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -300,9 +390,15 @@ class TestInterruption:
         arguments, (done, cut) = [*TINY, "integrator=bdf2"], interruption
         assert run(*arguments, "hydra.run.dir=whole")[0] == 0
         whole = {stage: done[stage] for stage in main_job.STAGES[:5]}
-        assert [*whole.values()] == [14, 14, 40, 40, 42]  # frames and their file, epochs, and frames of three models
+        # Frames and their file, epochs, and frames of three models.
+        assert [*whole.values()] == [14, 14, 40, 40, 42]
         done.clear()
-        for stage, at in {"simulate": 1, "reconstruct_resphys": 7, "train_resphys": 25, "evaluate": 18}.items():
+        for stage, at in {
+            "simulate": 1,
+            "reconstruct_resphys": 7,
+            "train_resphys": 25,
+            "evaluate": 18,
+        }.items():
             cut.clear()
             cut[stage, at] = signal.SIGTERM if stage == "evaluate" else signal.SIGINT
             code, err = run(*arguments, IN_RUN)
@@ -331,11 +427,17 @@ class TestInterruption:
 def test_what_fails_costs_one_sentence_and_leaves_nothing_half_made(folder, overrides, said):
     code, err = run(*overrides, IN_RUN)
     (line,) = [
-        line for line in err.splitlines() if not line.startswith(tuple(f"{stage}: " for stage in main_job.STAGES))
+        line
+        for line in err.splitlines()
+        if not line.startswith(tuple(f"{stage}: " for stage in main_job.STAGES))
     ]
     assert code == 2
     assert line.startswith("error: ")
     assert said in line
-    written = {path.name for path in Path("run").rglob("*") if path.is_file()} if Path("run").exists() else set()
+    written = (
+        {path.name for path in Path("run").rglob("*") if path.is_file()}
+        if Path("run").exists()
+        else set()
+    )
     assert not written & {"metrics.json", "report.html", "resphys.safetensors", "rollouts.h5"}
     assert not [name for name in written if name.endswith(".partial")]

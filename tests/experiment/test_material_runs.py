@@ -1,4 +1,6 @@
-"""Laws of silicones from tables of testing machines, through the command line, and the silicones of the package."""
+"""Laws of silicones from tables of testing machines, through the command line,
+and the silicones of the package.
+"""
 
 from pathlib import Path
 
@@ -28,7 +30,10 @@ def written(folder, header="time [s], displacement [mm], force [N]", noise=0.005
     strain = np.linspace(0.01, 2.0, 200)
     force = stress("tension", strain, SILICONE) * 18e-6
     force *= 1.0 + noise * np.random.default_rng(0).standard_normal(200)
-    rows = [f"{0.1 * k:.1f}, {33.0 * e:.4f}, {f:.5f}" for k, (e, f) in enumerate(zip(strain, force, strict=True))]
+    rows = [
+        f"{0.1 * k:.1f}, {33.0 * e:.4f}, {f:.5f}"
+        for k, (e, f) in enumerate(zip(strain, force, strict=True))
+    ]
     path = folder / "tension.csv"
     path.write_text("\n".join([header, *rows[:150], rows[149], *rows[150:]]), encoding="utf-8")
     return path
@@ -64,20 +69,32 @@ def test_a_table_gives_a_law(run):
     assert "Predicted rest" in (folder / "report.html").read_text(encoding="utf-8")
     assert (folder / "figures" / "curves.png").stat().st_size > 1_000
     assert "neo-Hookean term and Ogden's term of exponent 3" in result.out
-    assert np.isclose(warp_resphys.read_material(str(folder / "law.json")).values["c10"], law["parameters"]["c10"])
+    assert np.isclose(
+        warp_resphys.read_material(str(folder / "law.json")).values["c10"], law["parameters"]["c10"]
+    )
 
 
 def test_tables_of_other_machines(tmp_path):
     path = tmp_path / "other.csv"
-    path.write_text("Material;Ecoflex\n\nZeit (s);Dehnung;Spannung (MPa)\n0,1;0,1;0,002\n0,2;0,2;0,004\n;;\n", "utf-8")
-    described = read_test(path, TableSettings(columns=("time [s]", "strain [%]", "stress [MPa]"), header_lines=3))
+    path.write_text(
+        "Material;Ecoflex\n\nZeit (s);Dehnung;Spannung (MPa)\n0,1;0,1;0,002\n0,2;0,2;0,004\n;;\n",
+        "utf-8",
+    )
+    described = read_test(
+        path, TableSettings(columns=("time [s]", "strain [%]", "stress [MPa]"), header_lines=3)
+    )
     np.testing.assert_allclose(described["strain"], [0.001, 0.002])
     named = read_test(
-        path, TableSettings(names={"Dehnung": "strain", "Spannung (MPa)": "stress [MPa]"}, header_lines=2)
+        path,
+        TableSettings(
+            names={"Dehnung": "strain", "Spannung (MPa)": "stress [MPa]"}, header_lines=2
+        ),
     )
     np.testing.assert_allclose(named["stress"], [2e3, 4e3])
     assert [*named] == ["strain", "stress"]
-    path.write_text("Time,Extension,Displacement,Force\n[sec],,(mm),(N)\n0,0,1,2\n1,0,2,3\n2,0,3,4\n", "utf-8")
+    path.write_text(
+        "Time,Extension,Displacement,Force\n[sec],,(mm),(N)\n0,0,1,2\n1,0,2,3\n2,0,3,4\n", "utf-8"
+    )
     units_below = read_test(path)
     np.testing.assert_allclose(units_below["displacement"], [1e-3, 2e-3, 3e-3])
     assert [*units_below] == ["time", "displacement", "force"]
@@ -106,7 +123,12 @@ def test_refused_tables(tmp_path):
         read,
         "strain,time [s]\n0.1,2\n0.2,4",
     )
-    refuses(DataFileError, "has 2 of the columns strain and disp", read, "strain,displacement [mm],force [N]\n1,2,3\n")
+    refuses(
+        DataFileError,
+        "has 2 of the columns strain and disp",
+        read,
+        "strain,displacement [mm],force [N]\n1,2,3\n",
+    )
     refuses(DataFileError, "no line of numbers below a header", read, "strain,stress [kPa]\n")
     names = TableSettings(names={"Kraft": "force [N]"})
     refuses(DataFileError, "no single column is named 'Kraft'", read, "Weg,Kraf\n1,2\n", names)
@@ -126,12 +148,24 @@ def test_refused_tables(tmp_path):
         ("data.tests.tension.specimen.length=0", "length"),
         ("law.file=foo", "there is no law foo"),
         ("law.trials=2", "law.trials is for laws from trials"),
-        ("+simulation.youngs_modulus=1e5", "simulation has youngs_modulus, which tests of specimens identify"),
+        (
+            "+simulation.youngs_modulus=1e5",
+            "simulation has youngs_modulus, which tests of specimens identify",
+        ),
         ("data.scaled=true", "law.file is null, but data.scaled multiplies a law"),
         ("+data.tests.tension.held_out=true", "all tests are held out"),
-        ("data.tests.tension.kind=bulge", "a bulge test has a membrane, all others have a specimen"),
-        ("data.tests={lift: {kind: bulge, file: a.csv, membrane: {radius: 0.04}}}", "bulge tests scale a law"),
-        ("data.tests={lift: {kind: bulge, membrane: {radius: 0.04}}}", "bulge tests are not simulated"),
+        (
+            "data.tests.tension.kind=bulge",
+            "a bulge test has a membrane, all others have a specimen",
+        ),
+        (
+            "data.tests={lift: {kind: bulge, file: a.csv, membrane: {radius: 0.04}}}",
+            "bulge tests scale a law",
+        ),
+        (
+            "data.tests={lift: {kind: bulge, membrane: {radius: 0.04}}}",
+            "bulge tests are not simulated",
+        ),
     ],
 )
 def test_refused_configurations(tmp_path, change, said):
@@ -142,13 +176,20 @@ def test_refused_configurations(tmp_path, change, said):
 def lifted(folder, name, rings, factor, forces):
     """A table of a membrane of a law with twice the moduli of Ecoflex 00-30, under weights [N]."""
     law = {"c10": factor * warp_resphys.silicone("Ecoflex 00-30").values["c10"]}
-    head = "thickness_mm,contact_radius_mm,ring1_radius_mm,ring1_width_mm,ring2_radius_mm,ring2_width_mm"
-    rows = [f"# {head} = [4.0, 15.0, {rings}, nan, nan]", "height_mm,pressure_Pa,lifted_force_N", "2,5000,3"]
+    sizes = "ring1_radius_mm,ring1_width_mm,ring2_radius_mm,ring2_width_mm"
+    head = f"thickness_mm,contact_radius_mm,{sizes}"
+    rows = [
+        f"# {head} = [4.0, 15.0, {rings}, nan, nan]",
+        "height_mm,pressure_Pa,lifted_force_N",
+        "2,5000,3",
+    ]
     for force in forces:
         ring = () if "nan" in rings else (tuple(1e-3 * float(size) for size in rings.split(",")),)
         heights = np.linspace(10.0, 20.0, 11)
         pressures = Membrane(0.04, 0.004, 0.015, force, ring).response(heights / 40.0, law)[0]
-        rows += [f"{height:.1f},{p:.2f},{force:g}" for height, p in zip(heights, pressures, strict=True)]
+        rows += [
+            f"{height:.1f},{p:.2f},{force:g}" for height, p in zip(heights, pressures, strict=True)
+        ]
     (folder / name).write_text("\n".join(rows), encoding="utf-8")
 
 
@@ -167,7 +208,8 @@ def test_a_law_that_is_scaled_on_one_membrane_predicts_another(tmp_path):
         assert one["errors"]["range"]["unscaled"] > 0.1
     assert "The law is the given one times 2. It predicts 2 tests" in " ".join(said.split())
     assert (tmp_path / "run" / "figures" / "curves.png").stat().st_size > 1_000
-    (tmp_path / "membrane_0.csv").write_bytes((tmp_path / "membrane_5.csv").read_bytes())  # of two weights
+    # Of two weights.
+    (tmp_path / "membrane_0.csv").write_bytes((tmp_path / "membrane_5.csv").read_bytes())
     assert "data.range leaves 4 samples under 3 N" in refusal(*given, "data.range=[0.2, 0.34]")
 
 
@@ -175,10 +217,17 @@ def test_silicones_by_name():
     material = warp_resphys.silicone("Ecoflex 00-30")
     assert (
         material.values["c10"]
-        == read_json(Path(warp_resphys.__file__).parent / "laws/ecoflex_00_30.json")["parameters"]["c10"]
+        == read_json(Path(warp_resphys.__file__).parent / "laws/ecoflex_00_30.json")["parameters"][
+            "c10"
+        ]
     )
-    assert warp_resphys.silicone("DragonSkin 30").values == warp_resphys.silicone("dragon_skin_30").values
-    settings = MaterialSettings.model_validate({"model": "silicone", "name": "ecoflex_00_30", "density": 1100.0})
+    assert (
+        warp_resphys.silicone("DragonSkin 30").values
+        == warp_resphys.silicone("dragon_skin_30").values
+    )
+    settings = MaterialSettings.model_validate(
+        {"model": "silicone", "name": "ecoflex_00_30", "density": 1100.0}
+    )
     assert settings.model == "law"
     assert settings.values == {**settings.values, "c10": material.values["c10"], "density": 1100.0}
     refuses(InputError, "did you mean .*ecoflex_00_30", warp_resphys.silicone, "Ecoflex 00-31")
@@ -195,7 +244,10 @@ def test_silicones_by_name():
 
 @pytest.mark.slow
 def test_simulated_tensile_test(tmp_path):
-    """The experiment as it is: 1 % of noise and glued ends, a finer true mesh; and a machine that yields by 0.2 mm."""
+    """The experiment as it is: 1 % of noise and glued ends, a finer true mesh.
+
+    And a machine that yields by 0.2 mm.
+    """
     yielding = ("data.simulated.compliance=4.2e-5", "data.tests.tension.compliance=4e-5")
     for bound, change in ((0.01, ()), (0.02, yielding)):
         folder = tmp_path / str(bound)
@@ -218,10 +270,17 @@ def test_simulated_tensile_test(tmp_path):
     ],
 )
 def test_public_silicones_beyond_their_tests(shared_data, name):
-    """Identified from 5 to 100 % of strain: 3 % there (5 % Ecoflex), 12 % up to 200 %, within the 90 % interval."""
-    columns = TableSettings(columns=("time [s]", None, None, "strain", "stress [MPa]"), header_lines=18)
+    """Identified from 5 to 100 % of strain: 3 % there (5 % Ecoflex),
+    12 % up to 200 %, within the 90 % interval.
+    """
+    columns = TableSettings(
+        columns=("time [s]", None, None, "strain", "stress [MPa]"), header_lines=18
+    )
     read = read_test(shared_data / "silicone_tensile" / f"{name}.csv", columns)
-    inside, beyond = ((read["strain"] >= low) & (read["strain"] <= 2.0 * low + 0.9 * (low < 1)) for low in (0.05, 1.0))
+    inside, beyond = (
+        (read["strain"] >= low) & (read["strain"] <= 2.0 * low + 0.9 * (low < 1))
+        for low in (0.05, 1.0)
+    )
     test = MaterialTest("tension", read["strain"][inside], read["stress"][inside], zero=5e3)
     law = identify_from_tests({"tension": test}, density=1070.0)
     assert law.errors["tension"] < (0.05 if "Ecoflex" in name else 0.03)

@@ -1,4 +1,7 @@
-"""Contact from a configuration: obstacles, which may move, and surfaces of the body; robots that keep it."""
+"""Contact from a configuration: obstacles, which may move, and surfaces of the body.
+
+Robots that keep it.
+"""
 
 from pathlib import Path
 from unittest.mock import MagicMock
@@ -10,7 +13,17 @@ import torch
 from support.configured import settings
 from support.main_job import run_without_report
 from support.played_run import check_robots
-from warp_resphys import Body, Contact, DataFileError, HalfSpace, InputError, Robot, SurfaceContact, Twin, box_hexahedra
+from warp_resphys import (
+    Body,
+    Contact,
+    DataFileError,
+    HalfSpace,
+    InputError,
+    Robot,
+    SurfaceContact,
+    Twin,
+    box_hexahedra,
+)
 from warp_resphys.data.base_motion import contact_inputs, prescribed, rigid
 from warp_resphys.data.recordings.processing import obstacle_motion
 from warp_resphys.data.recordings.recording import ARM, Recording
@@ -32,10 +45,18 @@ from warp_resphys.studies.view import Page
 BEAM = "mesh.divisions=[4,1,1]"
 FLOOR = "{floor: {shape: half_space, position: [0, 0, -0.005]}}"
 TWO = (
-    "{floor: {shape: half_space, position: [0, 0, -0.05]}, ball: {shape: sphere, position: [0, 0, 0.1], radius: 0.01}}"
+    "{floor: {shape: half_space, position: [0, 0, -0.05]}, ball: {shape: sphere, position: [0, "
+    "0, 0.1], radius: 0.01}}"
 )
-LOWER = "{mesh: {kind: box_hexahedra, size: [0.1, 0.03, 0.06], divisions: [4, 1, 1]}, shift: [0.0, 0.0, -0.062]}"
-ABOVE = (BEAM, f"parts={{lower: {LOWER}}}", "self_contact={friction: 0.3, distance: 5e-4, stiffness: 2e4}")
+LOWER = (
+    "{mesh: {kind: box_hexahedra, size: [0.1, 0.03, 0.06], divisions: [4, 1, 1]}, shift: [0.0, "
+    "0.0, -0.062]}"
+)
+ABOVE = (
+    BEAM,
+    f"parts={{lower: {LOWER}}}",
+    "self_contact={friction: 0.3, distance: 5e-4, stiffness: 2e4}",
+)
 
 
 def simulator_of(*overrides):
@@ -52,19 +73,32 @@ def test_regions_have_factors_of_friction_and_parameters_a_name_for_each_obstacl
     (contact,), x = body.energies, body.vertices[:, 0]
     (points,) = contact.points(body.mesh)
     vertices = points.nodes[:, 0]
-    assert points.factors == pytest.approx(np.where(x > 0.095, 3.0, np.where(x > 0.085, 2.0, 1.0))[vertices])
+    assert points.factors == pytest.approx(
+        np.where(x > 0.095, 3.0, np.where(x > 0.085, 2.0, 1.0))[vertices]
+    )
     with pytest.raises(InputError, match="no region 'hand'"):
-        build_simulator(run.changed(contact=run.contact.changed(friction_factors={"hand": 1.0})), run.simulation)
-    simulator = simulator_of(BEAM, f"obstacles={TWO}", "contact={friction: {floor: 0.1, ball: 0.2}}")
-    assert {"contact_friction", "contact_friction_floor", "obstacle_x_ball", "obstacle_turn_y_floor"} <= {
-        *identifiable_parameters(simulator)
-    }
-    constants = constants_of(simulator, {"contact_friction_ball": torch.tensor([0.7, 0.8], dtype=torch.float64)})
+        build_simulator(
+            run.changed(contact=run.contact.changed(friction_factors={"hand": 1.0})), run.simulation
+        )
+    simulator = simulator_of(
+        BEAM, f"obstacles={TWO}", "contact={friction: {floor: 0.1, ball: 0.2}}"
+    )
+    assert {
+        "contact_friction",
+        "contact_friction_floor",
+        "obstacle_x_ball",
+        "obstacle_turn_y_floor",
+    } <= {*identifiable_parameters(simulator)}
+    constants = constants_of(
+        simulator, {"contact_friction_ball": torch.tensor([0.7, 0.8], dtype=torch.float64)}
+    )
     assert constants["contact_friction"].tolist() == [[0.1, 0.7], [0.1, 0.8]]
 
 
 def test_the_real_body_touches_the_same_obstacles_unless_it_has_its_own():
-    run = settings(BEAM, f"obstacles={FLOOR}", "contact={friction: 0.3}", "target.contact={friction: 0.6}")
+    run = settings(
+        BEAM, f"obstacles={FLOOR}", "contact={friction: 0.3}", "target.contact={friction: 0.6}"
+    )
     (played,) = build_body(target_settings(run, run.target)).energies
     assert isinstance(played, Contact)
     assert played.obstacles == {"floor": HalfSpace(position=(0.0, 0.0, -0.005))}
@@ -77,7 +111,9 @@ def test_the_real_body_touches_the_same_obstacles_unless_it_has_its_own():
 
 def robot_of(run, parameters):
     mesh = box_hexahedra((0.1, 0.03, 0.03), (4, 1, 1))
-    return Robot(Description("beam", "sysid", SimulatorSettings.of(run), run.simulation, mesh, parameters))
+    return Robot(
+        Description("beam", "sysid", SimulatorSettings.of(run), run.simulation, mesh, parameters)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -130,12 +166,19 @@ class TestSurfaces:
         assert contact.pairs == {"pad": FrictionPair(first="lower", second="body", friction=0.8)}
         given = {"surface_friction_pad": torch.tensor([0.5, 0.6], dtype=torch.float64)}
         assert given.keys() <= {*identifiable_parameters(simulator)}
-        assert constants_of(simulator, given)["surface_friction"].tolist() == [[0.3, 0.5], [0.3, 0.6]]
-        with pytest.raises(InputError, match=r"the pair 'pad' of a contact between surfaces: .*shell"):
+        assert constants_of(simulator, given)["surface_friction"].tolist() == [
+            [0.3, 0.5],
+            [0.3, 0.6],
+        ]
+        with pytest.raises(
+            InputError, match=r"the pair 'pad' of a contact between surfaces: .*shell"
+        ):
             build_body(settings(*ABOVE, pairs.replace("body", "shell")))
 
     def test_a_beam_lies_on_another_one_which_a_twin_refuses(self):
-        """The upper beam bends more than the thicker one below: in equilibrium its end lies on it."""
+        """The upper beam bends more than the thicker one below:
+        in equilibrium its end lies on it.
+        """
         upper, gaps = torch.arange(20 + 20) < 20, []
         for given in (ABOVE, ABOVE[:2]):
             simulator = simulator_of(*given, "integrator=bdf2")
@@ -148,27 +191,37 @@ class TestSurfaces:
 
 
 def swing(**more):
-    swings = {"a": {"frequency": 1.0, "translation": (0.01, 0.0, -0.02), "rotation": (0.2, 0.3, -0.1)}}
+    swings = {
+        "a": {"frequency": 1.0, "translation": (0.01, 0.0, -0.02), "rotation": (0.2, 0.3, -0.1)}
+    }
     return parse(MotionSettings, {"swings": swings, **more})
 
 
 def shown(poses, places, rate=100.0, labels=("ball",)):
     """A recording of points fixed to an obstacle."""
     points = rigid(poses).apply(np.broadcast_to(places, (len(poses), *np.shape(places))))
-    return Recording((*labels, "tip"), np.concatenate([points, points[:, :1]], axis=1), rate, Path("motion.h5"))
+    return Recording(
+        (*labels, "tip"), np.concatenate([points, points[:, :1]], axis=1), rate, Path("motion.h5")
+    )
 
 
 class TestMotions:
     def test_inputs_of_contact_move_obstacles_rigidly(self):
-        """A turn about a point outside of the obstacle moves its corners as it moves points of space."""
-        box = Box(edges=(0.02, 0.03, 0.04), position=(0.05, 0.01, -0.1), axis=(0.3, 0.2, 1.0), moves=True)
+        """A turn about a point outside of the obstacle moves its corners
+        as it moves points of space.
+        """
+        box = Box(
+            edges=(0.02, 0.03, 0.04), position=(0.05, 0.01, -0.1), axis=(0.3, 0.2, 1.0), moves=True
+        )
         obstacles = {"still": Sphere(radius=0.01, position=(0.0, 0.0, 1.0)), "box": box}
         body = Body(box_hexahedra((0.1, 0.02, 0.02), (2, 1, 1)), energies=[Contact(obstacles)])
         poses = prescribed(swing(about=(0.02, 0.0, 0.03)), np.linspace(0.0, 1.0, 7))
         rest = ObstacleSurface.of(body)
         moved = rest.moved(contact_inputs(body, {"box": poses}))
         still, corners = (np.flatnonzero(rest.owners == number) for number in (0, 1))
-        np.testing.assert_array_equal(moved.points[:, still], np.broadcast_to(rest.points[still], (7, len(still), 3)))
+        np.testing.assert_array_equal(
+            moved.points[:, still], np.broadcast_to(rest.points[still], (7, len(still), 3))
+        )
         expected = rigid(poses).apply(np.broadcast_to(rest.points[corners], (7, len(corners), 3)))
         np.testing.assert_allclose(moved.points[:, corners], expected, atol=1e-15)
         assert np.ptp(expected, axis=0).max() > 0.02
@@ -177,13 +230,19 @@ class TestMotions:
     def test_a_marker_shows_a_translation_and_a_rigid_body_a_turn_or_they_are_refused(self):
         poses = prescribed(swing(start=0.1, ramp=0.1), np.arange(100) / 100.0)
         places = np.array([0.3, 0.1, -0.2]) + ARM * np.eye(4, 3, -1)
-        whole = obstacle_motion(shown(poses, places, labels=("ball", "ball +x", "ball +y", "ball +z")), "ball", 0.05)
+        whole = obstacle_motion(
+            shown(poses, places, labels=("ball", "ball +x", "ball +y", "ball +z")), "ball", 0.05
+        )
         np.testing.assert_allclose(whole, poses, atol=2e-6)
         alone = obstacle_motion(shown(poses, places[:1]), "ball", 0.05)
-        np.testing.assert_allclose(alone[:, :3] + places[0], shown(poses, places[:1]).positions[:, 0], atol=2e-6)
+        np.testing.assert_allclose(
+            alone[:, :3] + places[0], shown(poses, places[:1]).positions[:, 0], atol=2e-6
+        )
         assert not alone[:, 3:].any()
         recording = shown(np.zeros((50, 6)), np.zeros((1, 3)))
-        with pytest.raises(DataFileError, match="no marker or rigid body 'bar', which shows the motion of this"):
+        with pytest.raises(
+            DataFileError, match="no marker or rigid body 'bar', which shows the motion of this"
+        ):
             obstacle_motion(recording, "bar", 0.05)
         recording.positions[:10, 0] = np.nan
         assert not obstacle_motion(recording, "ball", 0.2).any()
@@ -191,24 +250,37 @@ class TestMotions:
             obstacle_motion(recording, "ball", 0.05)
         recording.positions[:40:2, 0] = recording.positions[10:, 0] = np.nan
         recording.positions[3, 0] = 0.0
-        with pytest.raises(DataFileError, match="'ball' moves, and its marker is seen in 2 % of the frames"):
+        with pytest.raises(
+            DataFileError, match="'ball' moves, and its marker is seen in 2 % of the frames"
+        ):
             obstacle_motion(recording, "ball", 0.05)
 
     @pytest.mark.slow
     def test_a_recorded_bar_pushes_the_beam_of_the_laboratory_and_of_the_models(self, tmp_path):
         pushed = [
-            *("experiment=beam_pushed", "mesh.divisions=[6,1,1]", "laboratory.mesh.divisions=[6,1,1]"),
-            *("laboratory.time_step=0.01", "data.steps=40", "identify.max_evaluations=4", "identify.substeps=1"),
-            *("in_the_loop.epochs=1", "network.width=4", "simfree.trainer={epochs:4,rollout_every:2}"),
+            "experiment=beam_pushed",
+            "mesh.divisions=[6,1,1]",
+            "laboratory.mesh.divisions=[6,1,1]",
+            "laboratory.time_step=0.01",
+            "data.steps=40",
+            "identify.max_evaluations=4",
+            "identify.substeps=1",
+            "in_the_loop.epochs=1",
+            "network.width=4",
+            "simfree.trainer={epochs:4,rollout_every:2}",
             "simfree.network={position_modes:3,velocity_modes:3,layers:1,width:8}",
-            *("laboratory.train=[lift1,slide]", "laboratory.validation=[mixed]", "laboratory.test=[lift2]"),
+            "laboratory.train=[lift1,slide]",
+            "laboratory.validation=[mixed]",
+            "laboratory.test=[lift2]",
         ]
         folder = run_without_report(tmp_path, *pushed)
         dataset, configured = Trials.read(folder / "dataset.h5"), settings(*pushed)
         poses = dataset.obstacles["bar"]
         for row, name in enumerate(dataset.names):
             trial = configured.laboratory.trials[name].obstacle_motion["bar"]
-            np.testing.assert_allclose(poses[row], prescribed(trial, 0.01 * np.arange(41)), atol=3e-4)
+            np.testing.assert_allclose(
+                poses[row], prescribed(trial, 0.01 * np.arange(41)), atol=3e-4
+            )
         assert np.abs(poses[..., :3]).max() > 0.014
         assert not poses[..., 3:].any()
         errors = read_json(folder / "metrics.json")["errors_mm"]

@@ -1,4 +1,6 @@
-"""The package of docs/examples in an experiment from YAML: all its classes act, and its parameters are identified."""
+"""The package of docs/examples in an experiment from YAML:
+all its classes act, and its parameters are identified.
+"""
 
 import importlib.util
 import re
@@ -29,7 +31,9 @@ from warp_resphys.studies.gradient_check import check_gradients
 
 TEMPLATE = Path(__file__).parents[2] / "docs" / "examples" / "my_robot_physics"
 OPTIONS = [
-    *("experiment=magnetic_beam", "budget=quick", f"hydra.searchpath=[{(TEMPLATE / 'configs').as_uri()}]"),
+    "experiment=magnetic_beam",
+    "budget=quick",
+    f"hydra.searchpath=[{(TEMPLATE / 'configs').as_uri()}]",
     *("mesh.divisions=[6,1,1]", "laboratory.mesh.divisions=[6,1,1]", "parallel.processes=1"),
     *("simfree.trainer.epochs=6", "simfree.trainer.rollout_every=6", "trainer.gate=false"),
 ]
@@ -43,7 +47,9 @@ def install(site, version=None):
     shutil.copytree(TEMPLATE / "my_robot_physics", site / "my_robot_physics")
     about = site / f"my_robot_physics-{version}.dist-info"
     about.mkdir()
-    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {version}\n")
+    (about / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {version}\n"
+    )
     (about / "top_level.txt").write_text("my_robot_physics\n")
     return site
 
@@ -68,7 +74,9 @@ def folder(site, tmp_path_factory):
 
 @pytest.mark.slow
 def test_its_parameters_are_identified_and_its_network_trained(folder, installed):
-    """Weight and magnet bend the beam of the laboratory, of 50 kPa and 24 kA/m, from 40 kPa and 30 kA/m."""
+    """Weight and magnet bend the beam of the laboratory,
+    of 50 kPa and 24 kA/m, from 40 kPa and 30 kA/m.
+    """
     found = read_json(folder / "identification.json")["sysid"]["parameters"]
     assert found["magnetisation"] / found["shear_modulus"] == pytest.approx(24.0 / 50.0, rel=0.05)
     assert found["shear_modulus"] == pytest.approx(50e3, rel=0.2)
@@ -79,7 +87,9 @@ def test_its_parameters_are_identified_and_its_network_trained(folder, installed
     assert network.architecture["core"] == {"_target_": "my_robot_physics.sines.Sines", "width": 8}
     assert float(network.network.gain.detach().abs().max()) > 0.0
     records = {path.stem: read_json(path) for path in (folder / "stages").glob("*.json")}
-    assert {name for name, own in records.items() if own["packages"] != {"my-robot-physics": "0.1.0"}} == set()
+    assert {
+        name for name, own in records.items() if own["packages"] != {"my-robot-physics": "0.1.0"}
+    } == set()
 
 
 @pytest.mark.slow
@@ -92,7 +102,10 @@ def test_a_run_or_a_robot_without_the_package_says_so(folder, installed, tmp_pat
     torch.testing.assert_close(*moved)
     monkeypatch.setattr(sys, "path", [place for place in sys.path if place != str(installed)])
     for place in (folder, file):
-        with pytest.raises(DataFileError, match=r"was made with my-robot-physics 0\.1\.0, a package that is not inst"):
+        with pytest.raises(
+            DataFileError,
+            match=r"was made with my-robot-physics 0\.1\.0, a package that is not inst",
+        ):
             warp_resphys.load(place)
 
 
@@ -104,10 +117,15 @@ def test_another_version_is_told_and_runs_stages_again(installed, tmp_path, monk
     assert packages == {"my-robot-physics": "0.1.0"}
     check_packages(packages, "run")
     monkeypatch.setattr(sys, "path", [place for place in sys.path if place != str(installed)])
-    with pytest.raises(DataFileError, match=r"run was made with my-robot-physics 0\.1\.0, a package that is not inst"):
+    with pytest.raises(
+        DataFileError,
+        match=r"run was made with my-robot-physics 0\.1\.0, a package that is not inst",
+    ):
         check_packages(packages, "run")
     monkeypatch.syspath_prepend(str(install(tmp_path / "site", version="0.2.0")))
-    with pytest.raises(DataFileError, match=r"made with my-robot-physics 0\.1\.0, and this is .* 0\.2\.0"):
+    with pytest.raises(
+        DataFileError, match=r"made with my-robot-physics 0\.1\.0, and this is .* 0\.2\.0"
+    ):
         check_packages(packages, "run")
     assert settings(*OPTIONS).packages() == {"my-robot-physics": "0.2.0"}
     assert stage() != before
@@ -117,17 +135,44 @@ def test_another_version_is_told_and_runs_stages_again(installed, tmp_path, monk
     ("option", "message"),
     [
         ("simulation.model=arruda", r"model and _target_ are both given"),
-        ("simulation._target_=arruda", r"material model is 'arruda': choose one of corotated, .* class as _target_"),
-        ("simulation._target_=os.system", r"simulation: os\.system cannot be imported .*module of Python itself"),
-        ("simulation._target_=my_robot_physics.sines.Sines", r"Sines is no subclass of .*materials\.Material"),
+        (
+            "simulation._target_=arruda",
+            r"material model is 'arruda': choose one of corotated, .* class as _target_",
+        ),
+        (
+            "simulation._target_=os.system",
+            r"simulation: os\.system cannot be imported .*module of Python itself",
+        ),
+        (
+            "simulation._target_=my_robot_physics.sines.Sines",
+            r"Sines is no subclass of .*materials\.Material",
+        ),
         ("simulation.locking=3", r"simulation: arruda_boyce has no parameter 'locking'"),
-        ("energies.magnet._target_=my_robot.Magnet", r"energies\.magnet: .* cannot be imported .*No module named"),
-        ("energies.magnet._target_=my_robot_physics.magnet.Coil", r"magnet\.Coil cannot be imported .*no attribute"),
-        ("energies.magnet._target_=torch.nn.Linear", r"Linear is no subclass of warp_resphys\.energies\.base\.Energy"),
-        ("energies.magnet.magnetisatoin=3", r"unknown key 'energies\.magnet\.magnetisatoin', did you mean 'magnetisat"),
-        ("energies.magnet.magnetisation=null", r"energies\.magnet\.magnetisation is missing: it must be a positive"),
+        (
+            "energies.magnet._target_=my_robot.Magnet",
+            r"energies\.magnet: .* cannot be imported .*No module named",
+        ),
+        (
+            "energies.magnet._target_=my_robot_physics.magnet.Coil",
+            r"magnet\.Coil cannot be imported .*no attribute",
+        ),
+        (
+            "energies.magnet._target_=torch.nn.Linear",
+            r"Linear is no subclass of warp_resphys\.energies\.base\.Energy",
+        ),
+        (
+            "energies.magnet.magnetisatoin=3",
+            r"unknown key 'energies\.magnet\.magnetisatoin', did you mean 'magnetisat",
+        ),
+        (
+            "energies.magnet.magnetisation=null",
+            r"energies\.magnet\.magnetisation is missing: it must be a positive",
+        ),
         ("markers.bind=frame", r"markers\.observation takes the place of bind and bind_to"),
-        ("energies.magnet=null", r"simulator takes no input: give both the same inputs, by .* or energies"),
+        (
+            "energies.magnet=null",
+            r"simulator takes no input: give both the same inputs, by .* or energies",
+        ),
         (
             "muscles={commanded: stress, stiffness: 0, bundles: {a: {direction: [1, 0, 0]}}}",
             r"muscles and energies\.magnet are two inputs of the body",
@@ -141,7 +186,9 @@ def test_wrong_settings_are_refused_in_one_sentence(installed, option, message):
 
 
 def test_an_actuator_drives_the_body_as_its_energy_says(installed):
-    """The tip rises with the field, and its derivative by the magnetisation equals float64 differences."""
+    """The tip rises with the field, and its derivative
+    by the magnetisation equals float64 differences.
+    """
     run = settings(*OPTIONS)
     energy = build_body(run).energies[0]
     assert [quantity.name for quantity in energy.inputs] == ["magnetic_field"]
@@ -153,7 +200,11 @@ def test_an_actuator_drives_the_body_as_its_energy_says(installed):
 
     def height(magnetisation, field):
         inputs = warp_resphys.Inputs(magnetic_field=torch.tensor([[field]], dtype=torch.float64))
-        return simulator.static_equilibrium(inputs, {"magnetisation": magnetisation}).q[0, tip, 2].mean()
+        return (
+            simulator.static_equilibrium(inputs, {"magnetisation": magnetisation})
+            .q[0, tip, 2]
+            .mean()
+        )
 
     value = torch.tensor(30e3, dtype=torch.float64, requires_grad=True)
     end = height(value, 0.01)
@@ -180,49 +231,84 @@ class Arrays(nn.Module):
 """
 
 
-def test_classes_that_do_not_fit_are_refused_and_no_other_is_imported_or_called(tmp_path, monkeypatch):
+def test_classes_that_do_not_fit_are_refused_and_no_other_is_imported_or_called(
+    tmp_path, monkeypatch
+):
     """A robot's file may name anything; nothing of Python itself is imported."""
     (tmp_path / "bad_physics.py").write_text(MODULE)
     (tmp_path / "worse_physics.py").write_text("1 / 0")
     monkeypatch.syspath_prepend(str(tmp_path))
     for target, base, message in (
-        ("bad_physics.Unfinished", Energy, r"here: bad_physics\.Unfinished has no method points and no term: add it"),
-        ("bad_physics.Arrays", nn.Module, r"arguments of Arrays cannot be given in a configuration .*ndarray"),
-        ("worse_physics.Any", nn.Module, r"worse_physics\.Any cannot be imported \(ZeroDivisionError: division by"),
+        (
+            "bad_physics.Unfinished",
+            Energy,
+            r"here: bad_physics\.Unfinished has no method points and no term: add it",
+        ),
+        (
+            "bad_physics.Arrays",
+            nn.Module,
+            r"arguments of Arrays cannot be given in a configuration .*ndarray",
+        ),
+        (
+            "worse_physics.Any",
+            nn.Module,
+            r"worse_physics\.Any cannot be imported \(ZeroDivisionError: division by",
+        ),
     ):
         with pytest.raises(InputError, match=message):
             ClassSettings(target=target).factory(base, "here")
     for target in ("subprocess.Popen", "pathlib.Path", "numpy.memmap"):
         with pytest.raises(InputError, match=target):
-            ClassSettings(target=target, filename=str(tmp_path / "file"), mode="w+", shape=3).factory(nn.Module, "here")
+            ClassSettings(
+                target=target, filename=str(tmp_path / "file"), mode="w+", shape=3
+            ).factory(nn.Module, "here")
     assert not (tmp_path / "file").exists()
-    with pytest.raises(InputError, match=r"network\.core: \S*Wide maps \(2, 3\) to \(2, 7\): it must map to \(2, 2\)"):
+    with pytest.raises(
+        InputError,
+        match=r"network\.core: \S*Wide maps \(2, 3\) to \(2, 7\): it must map to \(2, 2\)",
+    ):
         OwnNetwork(ClassSettings(target=f"{__name__}.Wide"), 3, 2)
 
 
 def test_the_example_of_the_page_acts(tmp_path, monkeypatch):
     page = (TEMPLATE.parents[1] / "extending.md").read_text(encoding="utf-8")
-    python, yaml = (re.findall(rf"```{kind}\n(.*?)```", page, re.DOTALL)[0] for kind in ("python", "yaml"))
+    python, yaml = (
+        re.findall(rf"```{kind}\n(.*?)```", page, re.DOTALL)[0] for kind in ("python", "yaml")
+    )
     (tmp_path / "my_physics.py").write_text(python)
     monkeypatch.syspath_prepend(str(tmp_path))
     own = OmegaConf.to_container(OmegaConf.create(yaml))
     own["identify"]["parameters"] |= {"poissons_ratio": None, "youngs_modulus": None}
     config = composed("experiment=beam_real", "mesh.divisions=[4,1,1]")
     config |= {key: own[key] for key in ("simulation", "energies")}
-    config["identify"] |= {"parameters": own["identify"]["parameters"], "elastic": None, "first_guess": {}}
+    config["identify"] |= {
+        "parameters": own["identify"]["parameters"],
+        "elastic": None,
+        "first_guess": {},
+    }
     check(config)
     run = parse(RunSettings, config)
     simulator = build_simulator(run, run.simulation)
     state = simulator.static_equilibrium()
     assert float((state.q - simulator.rest_positions).abs().max()) > 1e-3
-    rows = {row.parameter: row.relative_error for row in check_gradients(simulator, "bent", steps=2)}
+    rows = {
+        row.parameter: row.relative_error for row in check_gradients(simulator, "bent", steps=2)
+    }
     named = {name.partition(",")[0] for name in rows}
-    assert {"shear_modulus", "stiffening", "lame_lambda", "spring_stiffness", "spring_anchor"} <= named
+    assert {
+        "shear_modulus",
+        "stiffening",
+        "lame_lambda",
+        "spring_stiffness",
+        "spring_anchor",
+    } <= named
     ours = {name: error for name, error in rows.items() if "damping" not in name}  # These are zero.
     assert max(ours.values()) < 1e-5
 
 
-@pytest.mark.parametrize("path", sorted((TEMPLATE / "tests").glob("test_*.py")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted((TEMPLATE / "tests").glob("test_*.py")), ids=lambda path: path.stem
+)
 def test_the_tests_of_the_package_pass(installed, path):
     spec = importlib.util.spec_from_file_location(f"template_{path.stem}", path)
     module = importlib.util.module_from_spec(spec)

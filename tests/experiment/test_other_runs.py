@@ -1,4 +1,6 @@
-"""What experiments are made of combines in whole runs of any bodies: payloads, releases, poses, bases and actuators."""
+"""What experiments are made of combines in whole runs of any bodies:
+payloads, releases, poses, bases and actuators.
+"""
 
 import numpy as np
 import pytest
@@ -24,7 +26,10 @@ from warp_resphys.settings.performed import MotionSettings
 
 pytestmark = pytest.mark.slow
 FEW = (
-    *("network.width=4", "trainer.epochs=4", "trainer.rollout_every=2", "simfree.trainer={epochs:4,rollout_every:2}"),
+    "network.width=4",
+    "trainer.epochs=4",
+    "trainer.rollout_every=2",
+    "simfree.trainer={epochs:4,rollout_every:2}",
     "simfree.network={position_modes:3,velocity_modes:3,layers:1,width:8}",
 )
 
@@ -54,9 +59,13 @@ class TestArm:
         place_segment(folder)
 
     def test_it_carries_payloads_that_the_networks_see(self):
-        own = "+laboratory.trials={t000:{payload:0.0},t001:{payload:0.03},t002:{payload:0.01},t003:{payload:0.02}}"
+        payloads = {"t000": 0.0, "t001": 0.03, "t002": 0.01, "t003": 0.02}
+        trials = ",".join(f"{name}:{{payload:{mass}}}" for name, mass in payloads.items())
+        own = f"+laboratory.trials={{{trials}}}"
         factor = "+identify.parameters.attached_mass_factor={lower:0.5,upper:1.5}"
-        folder = finish(*self.OPTIONS, "data.payload_at={z:-0.1}", "actuation.sees_payload=true", own, factor)
+        folder = finish(
+            *self.OPTIONS, "data.payload_at={z:-0.1}", "actuation.sees_payload=true", own, factor
+        )
         identified = results(folder)["parameters"]["sysid"]
         assert identified.keys() == {"youngs_modulus", "poissons_ratio", "attached_mass_factor"}
         dataset = Trials.read(folder / "dataset.h5")
@@ -64,14 +73,19 @@ class TestArm:
         heights = dataset.observed[:, 0, :, 2].mean(-1)  # m, at rest: the heavier, the lower
         assert np.argsort(-heights).tolist() == np.argsort(dataset.payload).tolist()
         tensors, _ = read_checkpoint(folder / "resphys.safetensors", "residual force")
-        assert len(tensors["actuation.scale"]) == 1 + 2 * 2  # the payload, two pressures and their means
+        # The payload, two pressures and their means.
+        assert len(tensors["actuation.scale"]) == 1 + 2 * 2
         check_robots(folder)
         code, err = run(*self.OPTIONS, own)
         assert (code, "data.payload_at is not set" in err) == (2, True)
 
     def test_it_is_pulled_aside(self):
         pulls = "{a:{pull:[0.9,0,0]},b:{pull:[0,0.9,0]},c:{pull:[0.6,0.6,0]},d:{pull:[-0.6,0.4,0]}}"
-        own = ["+laboratory.held_seconds=0.3", "+laboratory.seconds=0.15", f"+laboratory.trials={pulls}"]
+        own = [
+            "+laboratory.held_seconds=0.3",
+            "+laboratory.seconds=0.15",
+            f"+laboratory.trials={pulls}",
+        ]
         own += ["data.sequences=0", "data.cutoff=null", "data.begins=held", "data.seconds=0.1"]
         folder = finish(*self.OPTIONS, *own, "data.rest=file", "data.alignment=own")
         results(folder)
@@ -85,7 +99,10 @@ class TestArm:
         assert (code, "set data.rest to file" in err) == (2, True)
 
     def test_its_poses_and_motions_are_identified_and_corrected_together(self):
-        poses = ["+laboratory.trials={t000:{begins:static},t003:{begins:static}}", "data.sequences=5"]
+        poses = [
+            "+laboratory.trials={t000:{begins:static},t003:{begins:static}}",
+            "data.sequences=5",
+        ]
         split = ["data.train=[t000,t001]", "data.validation=[t002]", "data.test=[t003,t004]"]
         folder = finish(*self.OPTIONS, *poses, *split)
         metrics, dataset = results(folder), Trials.read(folder / "dataset.h5")
@@ -96,7 +113,8 @@ class TestArm:
         assert [row["name"] for row in metrics["per_trajectory"]] == ["t003", "t004"]
         with read_hdf5(folder / "reconstruction_resphys.h5", "reconstruction") as file:
             error = read_array(file, "error")[list(file.attrs["names"]).index("t000")]
-        assert error[1] < 0.2 * means(metrics)["sysid"]  # [mm]: a force brings the pose to its markers
+        # [mm]: a force brings the pose to its markers
+        assert error[1] < 0.2 * means(metrics)["sysid"]
         check_robots(folder)
 
 
@@ -105,20 +123,29 @@ def test_a_base_that_moves_is_told_by_markers():
     ways = {"s0": (4, "translation:[0,0.01,0]"), "s1": (3, "rotation:[0.2,0.2,0]")}
     ways |= {"s2": (5, "translation:[0,0,0.006]"), "s3": (4, "rotation:[0,0.1,0.2]")}
     swings = ",".join(
-        f"{name}:{{base_motion:{{start:0.05,ramp:0.05,swings:{{a:{{frequency:{hertz},{motion}}}}}}}}}"
+        f"{name}:{{base_motion:{{start:0.05,ramp:0.05,"
+        f"swings:{{a:{{frequency:{hertz},{motion}}}}}}}}}"
         for name, (hertz, motion) in ways.items()
     )
     folder = finish(
-        *("experiment=beam_moving_base", "mesh.divisions=[4,1,1]", "laboratory.mesh.divisions=[5,1,1]", *FEW[:1]),
-        *("identify.starts=1", "identify.candidates=0", "identify.max_evaluations=4", "identify.substeps=1"),
-        *("identify.elastic=null", "in_the_loop.epochs=2", *FEW[3:], "release.sideways=0", "correct_uncorrected=false"),
-        *(
-            "data.steps=30",
-            "laboratory.seconds=0.2",
-            "laboratory.train=[s0,s1]",
-            "laboratory.validation=[s2]",
-            "laboratory.test=[s3]",
-        ),
+        "experiment=beam_moving_base",
+        "mesh.divisions=[4,1,1]",
+        "laboratory.mesh.divisions=[5,1,1]",
+        *FEW[:1],
+        "identify.starts=1",
+        "identify.candidates=0",
+        "identify.max_evaluations=4",
+        "identify.substeps=1",
+        "identify.elastic=null",
+        "in_the_loop.epochs=2",
+        *FEW[3:],
+        "release.sideways=0",
+        "correct_uncorrected=false",
+        "data.steps=30",
+        "laboratory.seconds=0.2",
+        "laboratory.train=[s0,s1]",
+        "laboratory.validation=[s2]",
+        "laboratory.test=[s3]",
         *(f"+laboratory.trials={{{swings}}}", "data.base_motion=reference"),
     )
     errors = means(results(folder))
@@ -129,17 +156,30 @@ def test_a_base_that_moves_is_told_by_markers():
     swing = {"frequency": 3.0, "rotation": [0.2, 0.2, 0.0]}
     motion = parse(MotionSettings, {"start": 0.05, "ramp": 0.05, "swings": {"a": swing}})
     truth = prescribed(motion, dataset.times[1])
-    # Markers that are placed to 0.3 mm over 40 mm turn the frame by some 10 mrad, and its rotations by 0.3 of that.
+    # Markers that are placed to 0.3 mm over 40 mm turn the frame by some 10 mrad, and its rotations
+    # by 0.3 of that.
     assert np.abs(dataset.base[1, : len(truth), 3:] - truth[:, 3:]).max() < 0.01
     assert np.abs(truth[:, 3:]).max() > 0.19
     check_robots(folder, ("simulation", "sysid", "resphys"))
 
 
-OTHER = "{youngs_modulus: 7.5e4, poissons_ratio: 0.45, density: 1070, model: corotated, stiffness_damping: 8.0e-3}"
+OTHER = (
+    "{youngs_modulus: 7.5e4, poissons_ratio: 0.45, density: 1070, model: corotated, "
+    "stiffness_damping: 8.0e-3}"
+)
 CRAWLS = [
-    *("experiment=crawler", "mesh.divisions=[6,1,2]", "laboratory.mesh.divisions=[6,1,2]", "laboratory.time_step=0.01"),
-    *("~laboratory.material", f"+laboratory.material={OTHER}", "laboratory.placement_noise=0.0", "data.steps=100"),
-    *("data.horizons=[1.0]", *FEW, "laboratory.train=[fast,back]", "laboratory.validation=[between]"),
+    "experiment=crawler",
+    "mesh.divisions=[6,1,2]",
+    "laboratory.mesh.divisions=[6,1,2]",
+    "laboratory.time_step=0.01",
+    "~laboratory.material",
+    f"+laboratory.material={OTHER}",
+    "laboratory.placement_noise=0.0",
+    "data.steps=100",
+    "data.horizons=[1.0]",
+    *FEW,
+    "laboratory.train=[fast,back]",
+    "laboratory.validation=[between]",
     "laboratory.test=[faster]",
 ]
 
@@ -147,7 +187,9 @@ CRAWLS = [
 @pytest.mark.usefixtures("folder", "no_report")
 def test_a_crawler_shows_friction_and_stiffness_of_a_laboratory_that_lacks_nothing():
     folder = finish(*CRAWLS)
-    metrics, dataset, configured = results(folder), Trials.read(folder / "dataset.h5"), settings(*CRAWLS)
+    metrics = results(folder)
+    dataset = Trials.read(folder / "dataset.h5")
+    configured = settings(*CRAWLS)
     moved = 1e3 * (dataset.observed[:, -1] - dataset.observed[:, 0])[..., 0].mean(-1)
     ways = dict(zip(dataset.names, moved, strict=True))
     assert ways["faster"] > 4.0  # mm
@@ -162,28 +204,44 @@ def test_a_crawler_shows_friction_and_stiffness_of_a_laboratory_that_lacks_nothi
     check_robots(folder, tolerance=1e-7)
     robot = load(folder, "sysid")
     begun = robot.begin(muscle_stress=[0.0, 0.0, 0.0]).q[0]
-    assert 0.0 < float((begun - robot.simulator.rest_positions).abs().max()) < 1e-4  # It lies where it lay.
+    # It lies where it lay.
+    assert 0.0 < float((begun - robot.simulator.rest_positions).abs().max()) < 1e-4
     recordings = RunReader(folder, configured).recordings(robot.simulator.body.mesh, {})
-    assert set(recordings.beside) == {label for label in recordings.nominal if label.startswith("Floor")} != set()
+    assert (
+        set(recordings.beside)
+        == {label for label in recordings.nominal if label.startswith("Floor")}
+        != set()
+    )
 
 
 ROD = [
     "experiment=tendon_rod",
     *("mesh.layers=3", "mesh.nodes=20", "laboratory.mesh.layers=4", "laboratory.mesh.nodes=20"),
     *("data.steps=12", "data.sequences=5", "data.train=2", "data.validation=1", "data.test=1"),
-    *("data.horizons=[0.06,0.12]", "data.rest_seconds=0.01", "data.cutoff=20.0", "parallel={processes:1,batch:2}"),
+    "data.horizons=[0.06,0.12]",
+    "data.rest_seconds=0.01",
+    "data.cutoff=20.0",
+    "parallel={processes:1,batch:2}",
     *("laboratory.sequences.rest=0.01", "laboratory.sequences.correlation_time=0.03"),
     *("identify.trials=1", "identify.seconds=0.1", "identify.max_evaluations=3"),
-    *("network={position_modes:2,velocity_modes:0,force_modes:2,width:8}", "trainer={epochs:4,rollout_every:2}"),
+    "network={position_modes:2,velocity_modes:0,force_modes:2,width:8}",
+    "trainer={epochs:4,rollout_every:2}",
     "trainer.batch_size=16",
 ]
 
 
 def test_a_rod_whose_muscles_contract_goes_through_every_stage(folder):
     """The rod and the laboratory of the tendons with muscles in their place, by options alone."""
-    bundles = "front:{within:{x:[0,0.02]},direction:[0,0,1]},back:{within:{x:[-0.02,0]},direction:[0,0,1]}"
+    bundles = (
+        "front:{within:{x:[0,0.02]},direction:[0,0,1]},"
+        "back:{within:{x:[-0.02,0]},direction:[0,0,1]}"
+    )
     muscles = f"muscles={{commanded:stress,stiffness:0,bundles:{{{bundles}}}}}"
-    push = ["laboratory.sequences.mean=1e4", "laboratory.sequences.deviation=8e3", "data.input_limit=3e4"]
+    push = [
+        "laboratory.sequences.mean=1e4",
+        "laboratory.sequences.deviation=8e3",
+        "data.input_limit=3e4",
+    ]
     run_folder = finish(*ROD, "tendons=null", muscles, *push)
     assert {"simulation", "sysid", "simfree", "resphys"} <= results(run_folder)["errors_mm"].keys()
     check_robots(run_folder)
@@ -193,29 +251,47 @@ def test_a_rod_whose_muscles_contract_goes_through_every_stage(folder):
 
 
 def test_inputs_with_a_zero_that_differs_from_trial_to_trial(folder):
-    """Recordings begin under tensions that are logged with an error, which first frames show also of a test trial."""
+    """Recordings begin under tensions that are logged with an error,
+    which first frames show also of a test trial.
+    """
     deviation = 0.15  # N
     zero = f"{{lower: -0.6, upper: 0.6, per: trial, prior: {{mean: 0.0, deviation: {deviation}}}}}"
-    parameters = f"{{youngs_modulus: {{lower: 1e5, upper: 5e5, logarithmic: true}}, tendon_tension_zero: {zero}}}"
-    material = ("model=corotated", "poissons_ratio=0.45", "density=1070", "mass_damping=0", "stiffness_damping=5e-3")
+    parameters = (
+        "{youngs_modulus: {lower: 1e5, upper: 5e5, logarithmic: true}, "
+        f"tendon_tension_zero: {zero}}}"
+    )
+    material = (
+        "model=corotated",
+        "poissons_ratio=0.45",
+        "density=1070",
+        "mass_damping=0",
+        "stiffness_damping=5e-3",
+    )
     run_folder = finish(
         *ROD,
-        *("data.begins=driven", f"laboratory.zero_noise={deviation}", "identify.trials=null", "release.window=0.115"),
+        "data.begins=driven",
+        f"laboratory.zero_noise={deviation}",
+        "identify.trials=null",
+        "release.window=0.115",
         *("laboratory.noise=1e-5", "laboratory.placement_noise=0.0", "laboratory.tilt=0.0"),
         *(f"laboratory.material.{key}" for key in (*material, "prony_ratio_1=0")),
         *("laboratory.mesh.layers=3", "laboratory.mesh.nodes=20"),
-        *(f"++identify.parameters={parameters}", "identify.elastic=null", "identify.max_evaluations=12"),
+        f"++identify.parameters={parameters}",
+        "identify.elastic=null",
+        "identify.max_evaluations=12",
     )
     _, found, truth = results(run_folder, "identification", "truth")
     zeros = {name.split("@")[1]: value for name, value in found["sysid"]["of_trials"].items()}
     assert zeros.keys() == truth["zeros"].keys()
     errors = {name: abs(zeros[name] - value) for name, value in truth["zeros"].items()}
     assert max(errors.values()) < 0.4 * deviation
-    later = [name for name in errors if name not in ("t000", "t001")]  # of which the first frames show it
+    # Of which the first frames show it.
+    later = [name for name in errors if name not in ("t000", "t001")]
     assert max(errors[name] for name in later) < 0.1 * deviation
     deviations = found["sysid"]["of_trials_deviation"]
     ratios = [error / deviations[f"tendon_tension_zero@{name}"] for name, error in errors.items()]
-    assert np.sqrt(np.mean(np.square(ratios))) < 3.0  # the largest of four depends on where the search stops
+    # The largest of four depends on where the search stops.
+    assert np.sqrt(np.mean(np.square(ratios))) < 3.0
     page = (run_folder / "report.html").read_text()
     assert "Tendon tension zero [N]" in page
     assert "What could explain the remaining error" in page
@@ -224,20 +300,32 @@ def test_inputs_with_a_zero_that_differs_from_trial_to_trial(folder):
 
 
 def check_sensitivities(experiment, names):
-    """Derivatives of the markers are differences of roll-outs, by the zero of the trial where it has its own."""
+    """Derivatives of the markers are differences of roll-outs,
+    by the zero of the trial where it has its own.
+    """
     simulator, identified = experiment.model_simulator("sysid"), experiment.identified("sysid")
     found = sensitivities(simulator, experiment.motions, names, identified)
     parameters, step = experiment.parameters("sysid"), 1e-4
     for name in names:
         replay = experiment.motions.replay(exact(simulator), [name], identified)
         start = experiment.motions.start(replay, identified)
-        own = {"tendon_tension_zero": f"tendon_tension_zero@{name}", "youngs_modulus": "youngs_modulus"}
+        own = {
+            "tendon_tension_zero": f"tendon_tension_zero@{name}",
+            "youngs_modulus": "youngs_modulus",
+        }
         for key, moved in own.items():
             size = step * (float(parameters[moved]) if key == "youngs_modulus" else 1.0)
-            ends = [replay(start, {**parameters, moved: parameters[moved] + sign * size})[0, 0] for sign in (1, -1)]
+            ends = [
+                replay(start, {**parameters, moved: parameters[moved] + sign * size})[0, 0]
+                for sign in (1, -1)
+            ]
             slopes = ((ends[0] - ends[1]) / (2.0 * size)).numpy()
-            np.testing.assert_allclose(found[name].by_parameter[key], slopes, atol=2e-2 * np.abs(slopes).max())
-        np.testing.assert_allclose(found[name].points, replay(start, parameters)[0, 0].numpy(), atol=1e-9)
+            np.testing.assert_allclose(
+                found[name].by_parameter[key], slopes, atol=2e-2 * np.abs(slopes).max()
+            )
+        np.testing.assert_allclose(
+            found[name].points, replay(start, parameters)[0, 0].numpy(), atol=1e-9
+        )
 
 
 FACTOR = 1.3  # true over commanded contraction of the winch
@@ -246,14 +334,24 @@ HIDDEN = {"slow": [0], "fast": []}  # frames in which the second marker is, and 
 PERIODS = {"slow": 16.0, "fast": 9.0}  # steps
 LATE = {"slow": 0, "fast": 2}  # frames that the winch's log is behind the camera
 # where the markers of the second trial sit, with names of their own
-ELSEWHERE = ([0.0, -0.0070, -0.060], [0.0, -0.0120, -0.036], [0.0, -0.0125, 0.040], [0.0, -0.0065, 0.057])
+ELSEWHERE = (
+    [0.0, -0.0070, -0.060],
+    [0.0, -0.0120, -0.036],
+    [0.0, -0.0125, 0.040],
+    [0.0, -0.0065, 0.057],
+)
 LIMBS = (
     "experiment=starfish_limb",
     *("mesh.layers=6", "mesh.nodes=20", "fixed.z=[-0.03,0.03]", "tendons.routes.limbs.pieces=3"),
-    *("data.folder=recordings", f"data.steps={STEPS}", "data.train_fraction=1.0", "data.rest_seconds=0.05"),
+    "data.folder=recordings",
+    f"data.steps={STEPS}",
+    "data.train_fraction=1.0",
+    "data.rest_seconds=0.05",
     *("identify.max_evaluations=6", "~identify.parameters", "identify.first_guess={}"),
     "+identify.parameters={tendon_contraction_factor: {lower: 0.3, upper: 3.0, logarithmic: true}}",
-    *("trainer={epochs:4,rollout_every:2,batch_size:16}", "network={width:8}", "in_the_loop.epochs=1"),
+    "trainer={epochs:4,rollout_every:2,batch_size:16}",
+    "network={width:8}",
+    "in_the_loop.epochs=1",
     *("reconstruction.max_iterations=2", "parallel.processes=1", "data.trials=null"),
     "+data.trials={slow: {file: slow.csv, labels: [M1, M2, M3, M4]}, "
     "fast: {file: fast.csv, input_delay: -0.0333333333, labels: [N1, N2, N3, N4]}}",
@@ -263,26 +361,35 @@ LIMBS = (
 
 
 def swum(run, tracked):
-    """Commands (T,) of the winch and markers (T, 4, 3) in the frame of the body, by trial, both [m]."""
+    """Commands (T,) of the winch and markers (T, 4, 3)
+    in the frame of the body, by trial, both [m].
+    """
     simulator, motions = build_simulator(run, run.simulation), {}
     for name, period in PERIODS.items():
-        read = bound_markers(run.markers, simulator.body.mesh, [*tracked[name].values()], tuple(tracked[name]))
+        read = bound_markers(
+            run.markers, simulator.body.mesh, [*tracked[name].values()], tuple(tracked[name])
+        )
         steps = np.arange(STEPS + 4)
         commanded = 0.008 * np.sin(np.pi * np.clip(steps - 3, 0, None) / period) ** 2
         pulled = torch.as_tensor(FACTOR * commanded[1:, None, None])
         with torch.no_grad():
-            motion = simulator.rollout(simulator.rest_state(), len(steps) - 1, Inputs(tendon_contraction=pulled))
+            motion = simulator.rollout(
+                simulator.rest_state(), len(steps) - 1, Inputs(tendon_contraction=pulled)
+            )
         motions[name] = commanded, read(motion.q[:, 0]).numpy()
     return motions
 
 
 def write(folder, motions):
-    """Tables of a camera: two coordinates in mm of a body that drifts and turns, and a winch that begins late."""
+    """Tables of a camera: two coordinates in mm of a body that drifts and turns,
+    and a winch that begins late.
+    """
     folder.mkdir()
     draw = np.random.default_rng(0)
     for name, (commanded, markers) in motions.items():
         frames = np.arange(len(commanded))
-        angle, drift = 1.0 + 0.02 * frames, np.stack([0.3 - 0.002 * frames, 0.2 + 0.001 * frames], 1)
+        angle = 1.0 + 0.02 * frames
+        drift = np.stack([0.3 - 0.002 * frames, 0.2 + 0.001 * frames], 1)
         x, y = markers[..., 0], -markers[..., 2]  # of the camera
         turned = np.exp(1j * angle)[:, None] * (x + 1j * y)
         turned = np.stack([turned.real, turned.imag], -1)
@@ -290,11 +397,15 @@ def write(folder, motions):
         winch = np.where(frames < 2, np.nan, 1e3 * commanded[np.clip(frames - LATE[name], 0, None)])
         seen[HIDDEN[name], 1] = np.nan
         table = np.column_stack([1e3 * frames / 60.0, winch, seen.reshape(len(frames), -1)])
-        np.savetxt(folder / f"{name}.csv", table, delimiter=",", header="as the camera has it", fmt="%.9f")
+        np.savetxt(
+            folder / f"{name}.csv", table, delimiter=",", header="as the camera has it", fmt="%.9f"
+        )
 
 
 def test_limbs_that_swim_are_identified_by_their_shape(folder):
-    """Seen by one camera: whatever carries them off, what pulls them is identified, and corrected."""
+    """Seen by one camera: whatever carries them off,
+    what pulls them is identified, and corrected.
+    """
     wanted = settings(*LIMBS)
     tracked = {
         name: {label: wanted.markers.tracked[label] for label in trial.labels}
@@ -319,30 +430,45 @@ def test_limbs_that_swim_are_identified_by_their_shape(folder):
     factor = identified["sysid"]["parameters"]["tendon_contraction_factor"]
     assert factor == pytest.approx(FACTOR, rel=0.03)
     errors, by_marker = means(metrics), metrics["per_marker"]["sysid"]
-    assert {label: value is None for label, value in by_marker.items()} == dict.fromkeys(tracked["fast"], False)
-    assert {"paths_worst", "motion"} <= {path.stem for path in (run_folder / "figures").glob("*.png")}
+    assert {label: value is None for label, value in by_marker.items()} == dict.fromkeys(
+        tracked["fast"], False
+    )
+    assert {"paths_worst", "motion"} <= {
+        path.stem for path in (run_folder / "figures").glob("*.png")
+    }
     assert 3.0 * errors["sysid"] < errors["simulation"]
     assert errors["resphys"] < errors["sysid"] + 0.25 * NOISE  # nothing is left to learn
     check_robots(run_folder)
 
 
 def test_the_identified_material_on_other_bodies(folder, no_report):
-    """E and nu alone describe the target, so that the identification is exact on every body but for its mesh."""
+    """E and nu alone describe the target, so that the identification is exact
+    on every body but for its mesh.
+    """
     box = "{{kind:box_hexahedra,size:[0.08,0.02,0.02],divisions:[{}]}}".format
     thin, hung = f"mesh:{box('4,1,1')},fixed:{{x:0.0}}", "held:{weight_g:20,at:{x:0.08}}"
     long = "{kind:box_hexahedra,size:[0.1,0.03,0.03],divisions:[4,1,1]}"
     bundle = "{low:{direction:[1,0,0],within:{z:[0.0,0.03]}}}"
-    ranges = "{youngs_modulus:{lower:50e3,upper:1e6,logarithmic:true},poissons_ratio:{lower:0.3,upper:0.4995}}"
+    ranges = (
+        "{youngs_modulus:{lower:50e3,upper:1e6,logarithmic:true},"
+        "poissons_ratio:{lower:0.3,upper:0.4995}}"
+    )
     run_folder = finish(
-        *("target.poissons_ratio=0.4", "mesh.divisions=[4,1,1]", "data.steps=24", "data.weights_g.train=[60,140,200]"),
+        "target.poissons_ratio=0.4",
+        "mesh.divisions=[4,1,1]",
+        "data.steps=24",
+        "data.weights_g.train=[60,140,200]",
         f"identify={{parameters:{ranges},max_evaluations:12,tolerance:1e-10,seconds:0.2,trials:2}}",
-        *("data.weights_g.validation=[100]", "data.weights_g.test=[160]", "network.width=8", "timing=false"),
+        "data.weights_g.validation=[100]",
+        "data.weights_g.test=[160]",
+        "network.width=8",
+        "timing=false",
         *("trainer.epochs=2", "trainer.rollout_every=2"),
         f"+shapes.thin={{{thin},{hung}}}",
         f"+shapes.finer={{{thin},target_mesh:{box('8,2,2')},{hung}}}",
         f"+shapes.twisted={{{thin},held:{{twist_deg:40}}}}",
-        f"+shapes.muscle={{mesh:{long},fixed:{{x:0.0}},inputs:[2e4],muscles:{{commanded:stress,stiffness:0.0,"
-        f"bundles:{bundle}}}}}",
+        f"+shapes.muscle={{mesh:{long},fixed:{{x:0.0}},inputs:[2e4],"
+        f"muscles:{{commanded:stress,stiffness:0.0,bundles:{bundle}}}}}",
     )
     metrics, found = results(run_folder, "shapes")
     assert metrics["shapes"] == found
@@ -359,8 +485,12 @@ def test_the_identified_material_on_other_bodies(folder, no_report):
 
 @pytest.mark.usefixtures("folder", "no_report")
 def test_the_force_of_a_finger_is_predicted_from_motions_in_free_air():
-    """Blocked force: from SysID within 5 % of its mean (asked), which nothing without physics knows."""
-    metrics = results(finish("experiment=finger_force", "budget=quick", "law=null", "reconstruction=none"))
+    """Blocked force: from SysID within 5 % of its mean (asked),
+    which nothing without physics knows.
+    """
+    metrics = results(
+        finish("experiment=finger_force", "budget=quick", "law=null", "reconstruction=none")
+    )
     forces = metrics["forces"]["load"]
     errors = {model: summary["mean"] for model, summary in forces["models"].items()}
     assert forces["unit"] == "N"

@@ -1,4 +1,7 @@
-"""Bodies of several meshes, halves of bodies and their actuators from YAML; tests/dynamics has how they move."""
+"""Bodies of several meshes, halves of bodies and their actuators from YAML.
+
+Tests/dynamics has how they move.
+"""
 
 import numpy as np
 import pytest
@@ -13,7 +16,8 @@ from warp_resphys.settings.body import MuscleSettings, Route
 
 HALVES = [
     "mesh={kind: box_hexahedra, size: [0.05, 0.03, 0.03], divisions: [5, 2, 2]}",
-    "parts={tip: {mesh: {kind: box_hexahedra, size: [0.05, 0.03, 0.03], divisions: [5, 3, 3]}, shift: [0.05, 0, 0]}}",
+    "parts={tip: {mesh: {kind: box_hexahedra, size: [0.05, 0.03, 0.03], divisions: [5, 3, 3]}, "
+    "shift: [0.05, 0, 0]}}",
     "simulation.poissons_ratio=0.45",
 ]
 GLUED = "glued=[{region: tip, at: {x: 0.05}, to: body}]"
@@ -40,10 +44,16 @@ def test_halves_that_are_glued_bend_like_one_beam_and_half_of_one_behind_a_plane
 
 
 def test_a_region_of_another_mesh_has_its_own_material_and_may_be_rigid():
-    soft, _ = sag(*HALVES, GLUED, "simulation.regions={body: {}, tip: {youngs_modulus: 50e3}}", "law=null")
+    soft, _ = sag(
+        *HALVES, GLUED, "simulation.regions={body: {}, tip: {youngs_modulus: 50e3}}", "law=null"
+    )
     assert {"body_youngs_modulus", "tip_youngs_modulus"} <= set(soft.parameters)
     # A rigid part is followed; it cannot follow.
-    rigid = ["glued=[{region: body, at: {x: 0.05}, to: tip}]", "rigid={tip: {density: 1240}}", "integrator=bdf2"]
+    rigid = [
+        "glued=[{region: body, at: {x: 0.05}, to: tip}]",
+        "rigid={tip: {density: 1240}}",
+        "integrator=bdf2",
+    ]
     built, moved = sag(*HALVES, *rigid)
     tip = np.unique(built.body.mesh.cells[built.body.mesh.region("tip")])
     rest = built.body.vertices
@@ -61,9 +71,14 @@ def test_tendons_run_straight_between_their_guides_and_muscles_are_in_the_cells_
     assert tendons.names == ("left", "right")
     left, right = tendons.guides
     assert (len(left), len(right)) == (11, 2)
-    np.testing.assert_allclose(np.linalg.norm(np.diff(left, axis=0), axis=1), [0.06] * 5 + [0.08] * 5)
+    np.testing.assert_allclose(
+        np.linalg.norm(np.diff(left, axis=0), axis=1), [0.06] * 5 + [0.08] * 5
+    )
     np.testing.assert_allclose(left[[0, 5, 10]], routes["left"]["guides"])
-    bundles = {"root": {"direction": [1, 0, 0], "within": {"x": [0.0, 0.02]}}, "all": {"direction": [0, 1, 0]}}
+    bundles = {
+        "root": {"direction": [1, 0, 0], "within": {"x": [0.0, 0.02]}},
+        "all": {"direction": [0, 1, 0]},
+    }
     settings = parse(MuscleSettings, {"bundles": bundles, "commanded": "stress", "stiffness": 0.0})
     root, everywhere = build_muscles(settings, box_hexahedra((0.04, 0.01, 0.01), (4, 1, 1))).muscles
     assert (list(root.cells), root.name) == ([0, 1], "root")

@@ -1,4 +1,6 @@
-"""Materials from pictures: of simulated cameras or of files, by outlines, tracked points, clouds, and while moving."""
+"""Materials from pictures: of simulated cameras or of files, by outlines,
+tracked points, clouds, and while moving.
+"""
 
 import json
 import re
@@ -56,7 +58,8 @@ def poses(folder):
 def check_modulus(folder):
     """The simulator to correct has 200 kPa."""
     found = identified(folder)
-    modulus, deviation = found["parameters"]["youngs_modulus"], found["uncertainty"]["deviation"]["youngs_modulus"]
+    modulus = found["parameters"]["youngs_modulus"]
+    deviation = found["uncertainty"]["deviation"]["youngs_modulus"]
     assert modulus == pytest.approx(120e3, rel=0.05)
     assert abs(modulus - 120e3) < 4.0 * deviation
 
@@ -70,7 +73,9 @@ def succeeded(*arguments):
 
 @pytest.mark.slow
 class TestSimulatedLaboratory:
-    def test_the_material_comes_back_from_outlines_and_a_finished_search_is_kept(self, folder, monkeypatch):
+    def test_the_material_comes_back_from_outlines_and_a_finished_search_is_kept(
+        self, folder, monkeypatch
+    ):
         with monkeypatch.context() as patch:
             patch.setattr(stages, "law_content", MagicMock(side_effect=KeyboardInterrupt))
             assert outcome(*SIMULATED, IN_RUN).code
@@ -96,8 +101,11 @@ class TestSimulatedLaboratory:
         check_modulus(folder / "run")
         (tested,) = [row for row in poses(folder / "run").values() if row["tested"]]
         assert tested["outline_mm"]["sysid"] is None
-        assert tested["cloud_mm"]["sysid"] < 0.8  # the noise of 1 mm has a mean of 0.8 mm, along the line of sight
-        assert tested["cloud_mm"]["sysid"] < min(tested["cloud_mm"][own] for own in ("simulation", "undeformed"))
+        # The noise of 1 mm has a mean of 0.8 mm, along the line of sight.
+        assert tested["cloud_mm"]["sysid"] < 0.8
+        assert tested["cloud_mm"]["sysid"] < min(
+            tested["cloud_mm"][own] for own in ("simulation", "undeformed")
+        )
         assert {"distance", "clouds"} <= set(out.lower().split())  # compared in the table
         assert (folder / "run" / "figures" / "clouds.png").stat().st_size > 1e4
         assert not (folder / "run" / "figures" / "outlines.png").exists()
@@ -113,17 +121,22 @@ def pictures(tmp_path_factory):
 
 @pytest.fixture
 def recorded(pictures, folder):
-    """A folder of pictures with two cameras of which the first is wrong, a copy, a mesh and clamps of their own."""
+    """A folder of pictures with two cameras of which the first is wrong,
+    a copy, a mesh and clamps of their own.
+    """
     source = pictures / "level"
     pose = folder / "pictures" / "beam"
     pose.mkdir(parents=True)
     shutil.copy(source / "00_mask.png", pose / "00.png")
     shutil.copy(source / "00_mask.png", pose / "01.png")
     mask = np.asarray(Image.open(source / "00_mask.png"))
-    Image.fromarray(np.where(mask[..., None] > 0, (30, 90, 200), (20, 20, 20)).astype(np.uint8)).save(pose / "02.png")
+    Image.fromarray(
+        np.where(mask[..., None] > 0, (30, 90, 200), (20, 20, 20)).astype(np.uint8)
+    ).save(pose / "02.png")
     right = read_json(source / "camera.json")["frames"][0]["world_to_camera"]
     wrong = np.array(right)
-    wrong[:3, :3] = wrong[:3, :3] @ Rotation.from_euler("yz", (2.0, 0.4)).as_matrix()  # about the origin, out of view
+    # About the origin, out of view.
+    wrong[:3, :3] = wrong[:3, :3] @ Rotation.from_euler("yz", (2.0, 0.4)).as_matrix()
     meshio.write(pose / "mesh.vtk", meshio.Mesh(MESH.vertices, [("tetra", MESH.cells)]))
     frames = [
         {"image": "00.png", "mask": "00.png", "time": 0.0, "world_to_camera": wrong.tolist()},
@@ -148,11 +161,14 @@ RECORDED = [
 
 class TestPicturesOfAFolder:
     @pytest.mark.slow
-    def test_copies_count_once_the_better_camera_is_chosen_and_masks_are_files_or_colours(self, recorded):
+    def test_copies_count_once_the_better_camera_is_chosen_and_masks_are_files_or_colours(
+        self, recorded
+    ):
         out = succeeded(*RECORDED)
         assert Image.open(recorded / "run" / "masks" / "beam.png").size == SIZE
         with read_hdf5(recorded / "run" / "pictures.h5", "pictures") as file:
-            masks, frames = [file[f"beam/masks/{number}"][:] for number in (0, 2)], file["beam/frames"][:]
+            masks = [file[f"beam/masks/{number}"][:] for number in (0, 2)]
+            frames = file["beam/frames"][:]
         assert frames.tolist() == [0, 2]
         assert (masks[0] == masks[1]).mean() > 0.999
         camera = read_json(recorded / "run" / "identification.json")["cameras"]["beam"][""]
@@ -168,20 +184,27 @@ class TestPicturesOfAFolder:
 
     @pytest.mark.slow
     def test_a_tag_shows_the_camera(self, recorded):
-        """A frame without world_to_camera; of the two cameras that the tag allows, that which sees the body counts."""
+        """A frame without world_to_camera.
+
+        Of the two cameras that the tag allows, that which sees the body counts.
+        """
         pose = recorded / "pictures" / "beam"
         scene = read_json(pose / "camera.json")
         right = np.array(scene["frames"][1]["world_to_camera"])
         place, size = np.array([-0.045, 0.015, 0.0]), 0.05
         x, y, _ = np.eye(3)
-        image = draw_tag(np.asarray(Image.open(pose / "02.png")), right, np.array(MATRIX), place, x, y, size, 5)
+        image = draw_tag(
+            np.asarray(Image.open(pose / "02.png")), right, np.array(MATRIX), place, x, y, size, 5
+        )
         Image.fromarray(image).save(pose / "02.png")
         (pose / "camera.json").write_text(json.dumps({**scene, "frames": [{"image": "02.png"}]}))
         tag = f"data.tag={{dictionary:4x4_50,number:5,size:{size},centre:{place.tolist()}}}"
         assert "has no 'world_to_camera': give it, or the tag of data.tag" in refusal(*RECORDED)
         assert "does not show the tag 4 of 4x4_50" in refusal(*RECORDED, tag, "data.tag.number=4")
         succeeded(*RECORDED, tag, "identify.starts=2", "identify.candidates=6")
-        camera = np.array(read_json(recorded / "run" / "identification.json")["cameras"]["beam"][""])
+        camera = np.array(
+            read_json(recorded / "run" / "identification.json")["cameras"]["beam"][""]
+        )
         assert camera[:3, :3] == pytest.approx(right[:3, :3], abs=0.05)
         assert camera[:3, 3] == pytest.approx(right[:3, 3], abs=0.02)
         assert poses(recorded / "run")["beam"]["outline_mm"]["sysid"] < 0.5
@@ -192,17 +215,30 @@ class TestPicturesOfAFolder:
             ("data.poses.beam.frames=[0,9]", "name 9, but"),
             ("data.poses.beam.material=hard", "materials lacks 'hard'"),
             (
-                "identify.parameters.youngs_modulus={lower:1e4,upper:1e6,per:trial,prior:{mean:2e5,deviation:1e5}}",
+                "identify.parameters.youngs_modulus={lower:1e4,upper:1e6,per:trial,"
+                "prior:{mean:2e5,deviation:1e5}}",
                 "take material",
             ),
             ("data.test=[beam]", "which is in data.train as well"),
             ("identify=null", "identify is null, but data.kind is pictures"),
-            ("identify.parameters.gravity_tilt_1.per=session", "choose all, material, lens or trial"),
+            (
+                "identify.parameters.gravity_tilt_1.per=session",
+                "choose all, material, lens or trial",
+            ),
             ("identify.parameters.gravity_tilt_1.per=part", "choose all, material, lens or trial"),
-            ("identify.parameters.colour={lower:0,upper:1}", "identify.parameters names 'colour': choose from"),
+            (
+                "identify.parameters.colour={lower:0,upper:1}",
+                "identify.parameters names 'colour': choose from",
+            ),
             ("data.lens.file=calibration.yaml", "give one of them, a calibration or the matrix"),
-            ("data.poses.beam.points=tracked.csv", "points is empty, and data.poses.beam has some: give their places"),
-            ("data.simulated={place:[0,0,1],looks_at:[0,0,0]}", "data.folder is set: set data.simulated to null"),
+            (
+                "data.poses.beam.points=tracked.csv",
+                "points is empty, and data.poses.beam has some: give their places",
+            ),
+            (
+                "data.simulated={place:[0,0,1],looks_at:[0,0,0]}",
+                "data.folder is set: set data.simulated to null",
+            ),
         ],
     )
     def test_bad_input_gets_a_sentence(self, recorded, change, sentence):
@@ -222,10 +258,20 @@ class TestPicturesOfAFolder:
 
 class TestClouds:
     OPTIONS = (
-        *("experiment=camera_simulated", *COARSE, "data.folder=recorded", "data.simulated=null", "data.poses=null"),
-        *("data.train=[beam]", "data.test=[]", "identify.parameters.camera_shift_1.per=trial", IN_RUN),
+        "experiment=camera_simulated",
+        *COARSE,
+        "data.folder=recorded",
+        "data.simulated=null",
+        "data.poses=null",
+        "data.train=[beam]",
+        "data.test=[]",
+        "identify.parameters.camera_shift_1.per=trial",
+        IN_RUN,
     )
-    SCANNED = (*OPTIONS, "+data.poses={beam:{folder:beam,mesh:mesh.vtk,cloud:scan.ply,outline:false}}")
+    SCANNED = (
+        *OPTIONS,
+        "+data.poses={beam:{folder:beam,mesh:mesh.vtk,cloud:scan.ply,outline:false}}",
+    )
     FILMED = (*OPTIONS, "+data.poses={beam:{folder:beam,mesh:mesh.vtk}}")
 
     @pytest.fixture
@@ -236,14 +282,19 @@ class TestClouds:
         meshio.write(pose / "mesh.vtk", meshio.Mesh(MESH.vertices, [("tetra", MESH.cells)]))
         mesh = wr.box_tetrahedra((0.12, 0.03, 0.03), (4, 1, 1), 2)
         body = wr.Body(mesh, fixed=wr.select_vertices(mesh, x=0.0))
-        simulator = wr.Simulator(body, wr.Corotated(120e3, 0.49, density=1100.0), gravity=(0.0, -9.81, 0.0))
+        simulator = wr.Simulator(
+            body, wr.Corotated(120e3, 0.49, density=1100.0), gravity=(0.0, -9.81, 0.0)
+        )
         return pose, simulator.static_equilibrium().q[0], boundary_triangles(mesh)
 
     @pytest.mark.slow
     def test_a_scan_in_axes_of_its_own(self, beam, folder):
-        """A surface in mm, turned by a known and by an unknown rotation, of a folder without a camera."""
+        """A surface in mm, turned by a known and by an unknown rotation,
+        of a folder without a camera.
+        """
         pose, q, triangles = beam
-        known, unknown = Rotation.from_euler("xyz", (1.0, 2.0, -0.5)), Rotation.from_rotvec((0.05, -0.1, 0.08))
+        known = Rotation.from_euler("xyz", (1.0, 2.0, -0.5))
+        unknown = Rotation.from_rotvec((0.05, -0.1, 0.08))
         points = unknown.apply(q.numpy()) + (0.01, 0.02, -0.01)
         points = known.apply(points) + (0.4, 0.3, 0.2)
         trimesh.Trimesh(1e3 * points, triangles, process=False).export(pose / "scan.ply")
@@ -262,7 +313,9 @@ class TestClouds:
         assert "of its 20000 points are close enough to the clamp" in refusal(*in_mm)
 
     def film(self, beam, factor):
-        """Two cameras, on the left with depths and on the right with an outline and a longer lens than is assumed."""
+        """Two cameras, on the left with depths and on the right
+        with an outline and a longer lens than is assumed.
+        """
         pose, q, triangles = beam
         surface, clamp = ClosedSurface.of(triangles), torch.tensor([0.0, 0.015, 0.015])
         matrix, frames = torch.tensor(MATRIX, dtype=torch.float64), []
@@ -272,26 +325,40 @@ class TestClouds:
             looking[:3, 3] = np.array([0.0, 0.0, 0.35]) - looking[:3, :3] @ (0.06, 0.0, 0.015)
             camera = PlacedCamera(Lens(matrix), looking, clamp)
             corrections = camera.corrections({"focal_factor": own})
-            pixels, deep = camera.pixels(q, corrections).numpy(), camera.seen_from(q, corrections)[:, 2].numpy()
+            pixels = camera.pixels(q, corrections).numpy()
+            deep = camera.seen_from(q, corrections)[:, 2].numpy()
             mask = noisy_mask(surface.region(pixels), SIZE, 0.0, np.random.default_rng(0))
             Image.fromarray(mask).save(pose / f"{lens}.png")
             frames.append(
-                {"image": f"{lens}.png", "mask": f"{lens}.png", "lens": lens, "world_to_camera": looking.tolist()}
+                {
+                    "image": f"{lens}.png",
+                    "mask": f"{lens}.png",
+                    "lens": lens,
+                    "world_to_camera": looking.tolist(),
+                }
             )
             if lens == "left":
                 depth = depth_image(pixels[triangles], deep[triangles], SIZE)
                 np.save(pose / "left.npy", np.where(mask, depth, 1.5))  # m: a wall behind the body
                 frames[-1]["depth"] = "left.npy"
         (pose / "camera.json").write_text(json.dumps({"frames": frames}))
-        return ["~data.lens", f"+data.lens={{left:{{{LENS}}},right:{{{LENS}}}}}".replace("matrix=", "matrix:")]
+        return [
+            "~data.lens",
+            f"+data.lens={{left:{{{LENS}}},right:{{{LENS}}}}}".replace("matrix=", "matrix:"),
+        ]
 
     @pytest.mark.slow
     def test_two_cameras_have_a_lens_each(self, beam, folder):
         succeeded(*self.FILMED, *self.film(beam, 1.02))
         parameters = identified(folder / "run")["parameters"]
         assert parameters["youngs_modulus"] == pytest.approx(120e3, rel=0.04)
-        assert parameters["focal_factor@right"] - parameters["focal_factor@left"] == pytest.approx(0.02, abs=6e-3)
-        assert {*read_json(folder / "run" / "identification.json")["cameras"]["beam"]} == {"left", "right"}
+        assert parameters["focal_factor@right"] - parameters["focal_factor@left"] == pytest.approx(
+            0.02, abs=6e-3
+        )
+        assert {*read_json(folder / "run" / "identification.json")["cameras"]["beam"]} == {
+            "left",
+            "right",
+        }
         row = poses(folder / "run")["beam"]
         assert row["outline_mm"]["sysid"] < 0.5
         assert row["cloud_mm"]["sysid"] < 0.2
@@ -302,11 +369,23 @@ class TestClouds:
     @pytest.mark.parametrize(
         ("changes", "sentence"),
         [
-            (["data.poses.beam.outline=false", "data.poses.beam.depth=false"], "no points, no scan and no depth"),
-            (["~data.lens.left"], "frame 0 has the lens 'left', and data.lens has the names 'right'"),
+            (
+                ["data.poses.beam.outline=false", "data.poses.beam.depth=false"],
+                "no points, no scan and no depth",
+            ),
+            (
+                ["~data.lens.left"],
+                "frame 0 has the lens 'left', and data.lens has the names 'right'",
+            ),
             (["~data.lens", "+data.lens=null"], "data.lens is not set, and"),
-            (["+data.lens.beam={file:a.yaml}"], "data.poses and data.lens both have 'beam': rename one"),
-            (["identify.parameters.youngs_modulus.per=lens"], "per is lens, and is not of a camera"),
+            (
+                ["+data.lens.beam={file:a.yaml}"],
+                "data.poses and data.lens both have 'beam': rename one",
+            ),
+            (
+                ["identify.parameters.youngs_modulus.per=lens"],
+                "per is lens, and is not of a camera",
+            ),
         ],
     )
     def test_bad_input_gets_a_sentence(self, beam, changes, sentence):
@@ -317,10 +396,19 @@ class TestRelease:
     """A body that is released before a camera with a rolling shutter."""
 
     PLAYED = (
-        *("experiment=camera_released", *BEAM, "data.lens.row_time=4.0e-5", "data.simulated.size=[640,360]"),
+        "experiment=camera_released",
+        *BEAM,
+        "data.lens.row_time=4.0e-5",
+        "data.simulated.size=[640,360]",
         "data.points={tip:[0.12,0.015,0.03],corner:[0.12,0.0,0.03],middle:[0.06,0.015,0.03]}",
-        *("data.poses.released.release.at.x=0.12", "data.poses.pushed.release.at.x=0.12", "data.simulated.noise=0.5"),
-        *("data.simulated.frames=24", "identify.tolerance=1e-2", "data.train=[released,level]", "data.test=[]", IN_RUN),
+        "data.poses.released.release.at.x=0.12",
+        "data.poses.pushed.release.at.x=0.12",
+        "data.simulated.noise=0.5",
+        "data.simulated.frames=24",
+        "identify.tolerance=1e-2",
+        "data.train=[released,level]",
+        "data.test=[]",
+        IN_RUN,
     )
     TRACKED = "data.poses.released.points=tracked.csv"
     RECORDED = (*PLAYED, "data.folder=pictures", "data.simulated=null")
@@ -329,7 +417,8 @@ class TestRelease:
     def test_stiffness_density_and_damping_come_back(self, folder):
         out, run = succeeded(*self.PLAYED, self.TRACKED), folder / "run"
         found = identified(run)["parameters"]
-        assert found["youngs_modulus"] == pytest.approx(280e3, rel=0.05)  # the simulator to correct has 200 kPa,
+        # The simulator to correct has 200 kPa,.
+        assert found["youngs_modulus"] == pytest.approx(280e3, rel=0.05)
         assert found["density"] == pytest.approx(1180.0, rel=0.05)  # 1100 kg/m^3
         assert found["stiffness_damping"] == pytest.approx(5e-3, rel=0.1)  # and 2 ms
         assert found["release_delay@released"] == pytest.approx(7e-3, abs=1e-3)
@@ -338,11 +427,17 @@ class TestRelease:
         assert row["outline_mm"]["sysid"] < 0.5 * row["outline_mm"]["simulation"]
         assert row["points_mm"]["sysid"] < 0.5 * row["points_mm"]["undeformed"]
         page = (run / "report.html").read_text()
-        for name, true in {"Release delay, released [ms]": "7", "Gravity tilt 1, released [°]": "0"}.items():
+        for name, true in {
+            "Release delay, released [ms]": "7",
+            "Gravity tilt 1, released [°]": "0",
+        }.items():
             cells = re.sub(r"<[^>]*>", " ", page.partition(name)[2].partition("</tr>")[0]).split()
             assert cells[-1] == true
         assert "Stiffness damping [ms]: " in out
-        assert read_json(run / "law.json")["parameters"]["stiffness_damping"] == found["stiffness_damping"]
+        assert (
+            read_json(run / "law.json")["parameters"]["stiffness_damping"]
+            == found["stiffness_damping"]
+        )
 
     @pytest.fixture(scope="class")
     @classmethod
@@ -368,11 +463,26 @@ class TestRelease:
     @pytest.mark.parametrize(
         ("change", "sentence"),
         [
-            (lambda _, frames: frames[5].pop("time"), "frame 5 has no 'time', and its body is released: give it"),
-            (lambda _, frames: frames[5].update(time="late"), "frames[5].time is 'late': it must be a number, or null"),
-            (lambda _, frames: frames[5].update(time=0.02), "has the time 0.02 s, and frame 4 before it 0.0666667"),
-            (lambda scene, _: scene.update(frame_rate=0), "frame_rate is 0: it must be a positive number, or null"),
-            (lambda scene, frames: scene.update(frames=frames[:6]), "fewer than 3 different frames after the release"),
+            (
+                lambda _, frames: frames[5].pop("time"),
+                "frame 5 has no 'time', and its body is released: give it",
+            ),
+            (
+                lambda _, frames: frames[5].update(time="late"),
+                "frames[5].time is 'late': it must be a number, or null",
+            ),
+            (
+                lambda _, frames: frames[5].update(time=0.02),
+                "has the time 0.02 s, and frame 4 before it 0.0666667",
+            ),
+            (
+                lambda scene, _: scene.update(frame_rate=0),
+                "frame_rate is 0: it must be a positive number, or null",
+            ),
+            (
+                lambda scene, frames: scene.update(frames=frames[:6]),
+                "fewer than 3 different frames after the release",
+            ),
         ],
     )
     def test_times_that_do_not_fit_are_named(self, rewrite, change, sentence):
@@ -380,7 +490,9 @@ class TestRelease:
         assert sentence in refusal(*self.RECORDED)
 
     def test_a_frame_rate_gives_times(self, rewrite, folder):
-        """With which nothing is refused before the file of the tracked points, which lacks a frame."""
+        """With which nothing is refused before the file
+        of the tracked points, which lacks a frame.
+        """
 
         def change(scene, frames):
             scene["frame_rate"] = 60.0
@@ -400,7 +512,9 @@ class TestRelease:
 
 
 def test_noise_of_a_simulated_outline():
-    """Its standard deviation across the outline is the given one, and no part of the body is lost."""
+    """Its standard deviation across the outline is the given one,
+    and no part of the body is lost.
+    """
     region = shapely.Point(160.0, 120.0).buffer(80.0, quad_segs=64)
     for noise in (0.0, 2.0):
         mask = noisy_mask(region, (320, 240), noise, np.random.default_rng(0))
@@ -417,17 +531,26 @@ def test_the_verdict_says_where_an_identification_is_no_better():
 
     three = [result(0.5, 2.0, True)] * 3
     assert picture_verdict([*three, result(9.0, 1.0, False)]) == [
-        "The identified simulator has 75 % less error than the uncorrected simulator (on 3 of 3 poses kept back)."
+        "The identified simulator has 75 % less error than the uncorrected simulator (on 3 of 3 "
+        "poses kept back)."
     ]
     assert picture_verdict([*three[:2], result(9.0, 1.0, False)]) == [
-        "No evidence either way: 2 poses kept back (the identified simulator 0.500 mm and the uncorrected simulator "
-        "2.00 mm)."
+        "No evidence either way: 2 poses kept back (the identified simulator 0.500 mm and the "
+        "uncorrected simulator 2.00 mm)."
     ]
     uneven = [result(0.1, 5.0, True), result(1.1, 1.0, True), result(1.1, 1.0, True)]
     assert picture_verdict(uneven)[0].startswith("No evidence either way: 3 poses kept back")
-    assert picture_verdict([result(0.95, 1.0, True)])[1].startswith("Check before use: these poses hardly depend on ")
+    assert picture_verdict([result(0.95, 1.0, True)])[1].startswith(
+        "Check before use: these poses hardly depend on "
+    )
     (worse,) = picture_verdict([result(2.0, 1.0, True)] * 3)
-    assert worse.startswith("The uncorrected simulator has 50 % less error than the identified simulator (on 3 of 3")
-    assert picture_verdict([result(0.5, 2.0, False)])[1] == "Check before use: no pose was kept back."
-    away = replace(result(0.5, 2.0, True), overlap=dict.fromkeys(("undeformed", "simulation", "sysid"), 0.1))
+    assert worse.startswith(
+        "The uncorrected simulator has 50 % less error than the identified simulator (on 3 of 3"
+    )
+    assert (
+        picture_verdict([result(0.5, 2.0, False)])[1] == "Check before use: no pose was kept back."
+    )
+    away = replace(
+        result(0.5, 2.0, True), overlap=dict.fromkeys(("undeformed", "simulation", "sysid"), 0.1)
+    )
     assert "'a' hardly overlap: check the camera" in picture_verdict([away])[1]

@@ -1,4 +1,6 @@
-"""Poses under tendons, recorded without header, names or order of their markers, from a table to the report."""
+"""Poses under tendons, recorded without header, names or order of their markers,
+from a table to the report.
+"""
 
 import numpy as np
 import pytest
@@ -21,27 +23,51 @@ from warp_resphys.stepping.inputs import Inputs
 
 MODULUS = 420e3  # Pa, of the body that is recorded; the experiment expects 505 kPa
 OFFSETS = {"first": 1e-3, "second": -8e-4}  # m, around the axis, by which its tendons run elsewhere
-POSES = {"weak": (0.5, 0.0), "strong": (1.5, 0.0), "second": (0.0, 1.5), "other": (0.0, 1.0), "both": (1.0, 1.0)}
+POSES = {
+    "weak": (0.5, 0.0),
+    "strong": (1.5, 0.0),
+    "second": (0.0, 1.5),
+    "other": (0.0, 1.0),
+    "both": (1.0, 1.0),
+}
 TINY = [
-    *("experiment=tentacle", "mesh.layers=4", "mesh.nodes=20", "parallel.processes=1", "markers.patch=0.05"),
-    *("tendons.routes.first.pieces=6", "tendons.routes.second.pieces=6", "data.folder=recordings", "data.folds=null"),
-    *("data.train=[weak,strong,second]", "data.validation=[other]", "data.test=[both]", "identify.max_evaluations=6"),
-    *("trainer={epochs:2,rollout_every:2,batch_size:16}", "network={position_modes:1,force_modes:2,width:8}"),
+    "experiment=tentacle",
+    "mesh.layers=4",
+    "mesh.nodes=20",
+    "parallel.processes=1",
+    "markers.patch=0.05",
+    "tendons.routes.first.pieces=6",
+    "tendons.routes.second.pieces=6",
+    "data.folder=recordings",
+    "data.folds=null",
+    "data.train=[weak,strong,second]",
+    "data.validation=[other]",
+    "data.test=[both]",
+    "identify.max_evaluations=6",
+    "trainer={epochs:2,rollout_every:2,batch_size:16}",
+    "network={position_modes:1,force_modes:2,width:8}",
     *("in_the_loop.epochs=1", "simfree.network.position_modes=1", "~identify.parameters.density"),
-    *(f"~identify.parameters.tendon_offset_2_{name}" for name in OFFSETS),  # weak poses do not show them
+    # weak poses do not show them
+    *(f"~identify.parameters.tendon_offset_2_{name}" for name in OFFSETS),
 ]
 
 
 def trials(tensions=POSES, sessions=None):
     """Options with the trials of the poses."""
     named = {name: f", session: {session}" for name, session in (sessions or {}).items()}
-    rows = (f"{n}: {{file: {n}.csv, inputs: {list(own)}{named.get(n, '')}}}" for n, own in tensions.items())
+    rows = (
+        f"{n}: {{file: {n}.csv, inputs: {list(own)}{named.get(n, '')}}}"
+        for n, own in tensions.items()
+    )
     return ["data.trials=null", f"+data.trials={{{','.join(rows)}}}"]
 
 
 @pytest.fixture(scope="module")
 def poses():
-    """(5, 5, 3) where the markers of the poses are in the frame of the body [m]; its tendons run elsewhere."""
+    """(5, 5, 3) where the markers of the poses are in the frame of the body [m].
+
+    Its tendons run elsewhere.
+    """
     run = settings(*TINY, *trials())
     routes = {}
     for name, route in run.tendons.routes.items():
@@ -53,15 +79,20 @@ def poses():
     read = bound_markers(run.markers, simulator.body.mesh, places, tuple(run.markers.tracked))
     tensions = torch.tensor([*POSES.values()], dtype=torch.float64)
     at = read(simulator.static_equilibrium(Inputs(tendon_tension=tensions)).q).numpy()
-    return np.concatenate([at, np.broadcast_to([*run.markers.reference.values()], (len(at), 1, 3))], 1)
+    return np.concatenate(
+        [at, np.broadcast_to([*run.markers.reference.values()], (len(at), 1, 3))], 1
+    )
 
 
 def write(folder, places_of_poses):
-    """Files as a tracker writes them: no header, another order in each, y against the rod, 0.1 mm of noise."""
+    """Files as a tracker writes them: no header, another order in each,
+    y against the rod, 0.1 mm of noise.
+    """
     folder.mkdir()
     draw = np.random.default_rng(0)
     for name, places in zip(POSES, places_of_poses, strict=True):
-        turned = np.stack([places[:, 0], -places[:, 2], places[:, 1]], -1)  # so that (x, z, -y) turns it back
+        # So that (x, z, -y) turns it back.
+        turned = np.stack([places[:, 0], -places[:, 2], places[:, 1]], -1)
         row = turned[draw.permutation(5)] + [0.3, 0.4, -0.1]
         frames = row.ravel() + 1e-4 * draw.normal(size=(40, 15))
         table = np.column_stack([np.arange(40), np.arange(40) / 200.0, frames])
@@ -75,17 +106,23 @@ def test_poses_of_unnamed_markers_identify_the_body(poses, folder, monkeypatch):
     dataset = Trials.read(run / "dataset.h5")
     rows = [dataset.names.index(name) for name in POSES]
     assert set(dataset.begins) == {"static"}
-    np.testing.assert_allclose(dataset.observed[rows, 0], poses[:, :4], atol=3e-4)  # named and turned back
-    np.testing.assert_allclose(dataset.inputs["tendon_tension"][rows, 0], [*POSES.values()], atol=1e-12)
+    # Named and turned back.
+    np.testing.assert_allclose(dataset.observed[rows, 0], poses[:, :4], atol=3e-4)
+    np.testing.assert_allclose(
+        dataset.inputs["tendon_tension"][rows, 0], [*POSES.values()], atol=1e-12
+    )
     identified = read_json(run / "identification.json")["sysid"]["parameters"]
     assert identified["youngs_modulus"] == pytest.approx(MODULUS, rel=0.01)
-    assert {name: identified[f"tendon_offset_1_{name}"] for name in OFFSETS} == pytest.approx(OFFSETS, abs=2e-4)
+    assert {name: identified[f"tendon_offset_1_{name}"] for name in OFFSETS} == pytest.approx(
+        OFFSETS, abs=2e-4
+    )
     page, metrics = (run / "report.html").read_text(), read_json(run / "metrics.json")
     assert "Tendon offset 1 first" in page
     errors = {name: summary["mean"] for name, summary in metrics["errors_mm"].items()}
     assert 5.0 * errors["sysid"] < errors["simulation"]
     assert {"simfree", "resphys"} <= errors.keys()
-    assert metrics["networks"]["resphys"]["test"]["trials"] == ["weak", "strong", "second"]  # one pose is no test
+    # One pose is no test.
+    assert metrics["networks"]["resphys"]["test"]["trials"] == ["weak", "strong", "second"]
     checked = metrics["mesh_check"]
     assert checked["cells"][1] == 1.5 * checked["cells"][0] == 30
     assert 0.1 < checked["moved_mm"] < 10.0
@@ -96,10 +133,18 @@ def test_poses_of_unnamed_markers_identify_the_body(poses, folder, monkeypatch):
 @pytest.mark.slow
 def test_sessions_have_their_markers_and_trials_their_gains(poses, tmp_path):
     """Between two sessions a marker moved by 4 mm; one tension is 7 % larger than its log says."""
-    sessions = {"weak": "monday", "strong": "monday", "other": "friday", "second": "friday", "both": "friday"}
+    sessions = {
+        "weak": "monday",
+        "strong": "monday",
+        "other": "friday",
+        "second": "friday",
+        "both": "friday",
+    }
     logged = {**POSES, "strong": (1.5 / 1.07, 0.0)}
     moved = poses.copy()
-    moved[[list(POSES).index(name) for name, session in sessions.items() if session == "friday"], 1, 2] -= 4e-3
+    moved[
+        [list(POSES).index(name) for name, session in sessions.items() if session == "friday"], 1, 2
+    ] -= 4e-3
     write(tmp_path / "recordings", moved)
     gain = "{lower: 0.7, upper: 1.3, per: trial, prior: {mean: 1.0, deviation: 0.05}}"
     folder = run_without_report(
@@ -109,20 +154,34 @@ def test_sessions_have_their_markers_and_trials_their_gains(poses, tmp_path):
         f"+identify.parameters.tendon_tension_factor={gain}",
         *("mesh_check=null", "identify.max_evaluations=8"),
     )
-    assert dict(zip((data := Trials.read(folder / "dataset.h5")).names, data.sessions, strict=True)) == sessions
+    assert (
+        dict(zip((data := Trials.read(folder / "dataset.h5")).names, data.sessions, strict=True))
+        == sessions
+    )
     found = read_json(folder / "identification.json")["sysid"]
-    own = {name.removeprefix("tendon_tension_factor@"): value for name, value in found["of_trials"].items()}
-    assert own.keys() == {"weak", "strong", "second"} == {name.split("@")[1] for name in found["of_trials_deviation"]}
+    own = {
+        name.removeprefix("tendon_tension_factor@"): value
+        for name, value in found["of_trials"].items()
+    }
+    assert (
+        own.keys()
+        == {"weak", "strong", "second"}
+        == {name.split("@")[1] for name in found["of_trials_deviation"]}
+    )
     assert own["strong"] - 0.5 * (own["weak"] + own["second"]) > 0.03
     assert found["parameters"]["tendon_tension_factor"] == 1.0
     assert found["uncertainty"]["deviation"]["tendon_tension_factor"] == 0.05
     assert not any("@" in name for name in found["uncertainty"]["deviation"])
-    monday, friday = (found["placement"]["sessions"][session]["offsets"] for session in ("monday", "friday"))
+    monday, friday = (
+        found["placement"]["sessions"][session]["offsets"] for session in ("monday", "friday")
+    )
     further, other = (friday[marker][2] - monday[marker][2] for marker in ("M2", "M3"))
-    assert further - other == pytest.approx(-4e-3, abs=1.2e-3)  # The frame of a session may be shifted, too.
+    # The frame of a session may be shifted, too.
+    assert further - other == pytest.approx(-4e-3, abs=1.2e-3)
     table = trials_table(Identification.from_plain(found))
     assert [row.head for row in table.rows] == ["weak", "strong", "second"]
-    with read_hdf5(folder / "rollouts.h5", "rollouts") as file:  # A new trial has a gain that is not known.
+    # A new trial has a gain that is not known.
+    with read_hdf5(folder / "rollouts.h5", "rollouts") as file:
         assert 1e3 * np.sqrt(read_array(file, "sysid_spread").max()) > 1.0
     robot = warp_resphys.load(folder, "sysid")
     assert "tendon_tension_factor@strong" not in robot.description.parameters
@@ -145,17 +204,25 @@ def test_a_finer_mesh_has_so_many_times_as_many_cells():
 
 @pytest.mark.slow
 def test_intervals_of_another_session_come_from_poses_left_out_of_the_training(poses, tmp_path):
-    """Without validation poses, and with markers that may sit 3.4 mm elsewhere in the session of the test pose."""
+    """Without validation poses, and with markers that may sit 3.4 mm elsewhere
+    in the session of the test pose.
+    """
     write(tmp_path / "recordings", poses)
     sessions = dict.fromkeys(POSES, "monday") | {"both": "friday"}
-    training = ["data.train=[weak,strong,second,other]", "data.validation=[]", "in_the_loop.hold_out=false"]
+    training = [
+        "data.train=[weak,strong,second,other]",
+        "data.validation=[]",
+        "in_the_loop.hold_out=false",
+    ]
     quick = ["mesh_check=null", "trainer.epochs=1"]
     folder = run_without_report(tmp_path, *TINY, *trials(POSES, sessions), *training, *quick)
     intervals = read_json(folder / "errors.json")["intervals"]
     assert intervals["calibrated_on"] == "left_out"
     found = read_json(folder / "identification.json")["sysid"]
     assert [*found["uncertainty"]["left_out"]] == ["weak", "strong", "second", "other"]
-    assert found["placement"]["new_session"][0][0] == pytest.approx(0.005 * np.sqrt(0.25 + 1.0 / 5.0))
+    assert found["placement"]["new_session"][0][0] == pytest.approx(
+        0.005 * np.sqrt(0.25 + 1.0 / 5.0)
+    )
     own = intervals["models"]["sysid"]
     assert own["coverage"] == 1.0  # The markers have not moved.
     assert own["half_width_mm"] > 1e3 * found["placement"]["new_session"][0][0]

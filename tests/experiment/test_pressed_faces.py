@@ -17,14 +17,20 @@ BOX = {"kind": "box_hexahedra", "size": [0.02, 0.02, 0.005], "divisions": [2, 2,
 def body_of(faces, mesh=BOX, fixed=None, **chambers):
     """A body, by default held everywhere but in its middle."""
     fixed = {"z": [0.0, 0.005]} if fixed is None else fixed
-    return parse(BodySettings, {"mesh": mesh, "fixed": fixed, "chambers": {"faces": faces, **chambers}}, "body")
+    return parse(
+        BodySettings,
+        {"mesh": mesh, "fixed": fixed, "chambers": {"faces": faces, **chambers}},
+        "body",
+    )
 
 
 def test_faces_by_place_and_by_the_name_of_a_surface(tmp_path):
     box = box_hexahedra((0.02, 0.02, 0.005), (2, 2, 1))
     lower, right = select_faces(box, z=0.0), select_faces(box, x=0.02)
     write_mesh(tmp_path / "box.msh", box, {"right side": right})
-    settings = body_of({"below": {"z": 0.0}, "side": "right side"}, {"kind": "file", "path": f"{tmp_path}/box.msh"})
+    settings = body_of(
+        {"below": {"z": 0.0}, "side": "right side"}, {"kind": "file", "path": f"{tmp_path}/box.msh"}
+    )
     body = build_body(settings)
     (pressure,) = body.energies
     for chamber, faces in zip(pressure.chambers, (lower, right), strict=True):
@@ -37,14 +43,31 @@ def test_faces_by_place_and_by_the_name_of_a_surface(tmp_path):
     ("message", "options"),
     [
         ("count is 0, and faces has none: give the number", {"faces": {}}),
-        ("the mesh has 0 closed chambers, but chambers.count is 1: .* name them in chambers.faces", {"count": 1}),
-        (r"chambers\.faces\.below: no vertex lies within 1e-09 m of z = 1 m", {"faces": {"below": {"z": 1.0}}}),
-        (r"chambers\.faces\.below: no face of the surface", {"faces": {"below": {"z": 0.0, "x": 0.0}}}),
-        (r"chambers\.faces\.below: only meshes from a file have named surfaces", {"faces": {"below": "lid"}}),
+        (
+            "the mesh has 0 closed chambers, but chambers.count is 1: "
+            ".* name them in chambers.faces",
+            {"count": 1},
+        ),
+        (
+            r"chambers\.faces\.below: no vertex lies within 1e-09 m of z = 1 m",
+            {"faces": {"below": {"z": 1.0}}},
+        ),
+        (
+            r"chambers\.faces\.below: no face of the surface",
+            {"faces": {"below": {"z": 0.0, "x": 0.0}}},
+        ),
+        (
+            r"chambers\.faces\.below: only meshes from a file have named surfaces",
+            {"faces": {"below": "lid"}},
+        ),
     ],
 )
 def test_refusals(message, options):
-    refuses(ResphysError, message, lambda: build_body(body_of(**{"faces": {"below": {"z": 0.0}}, **options})))
+    refuses(
+        ResphysError,
+        message,
+        lambda: build_body(body_of(**{"faces": {"below": {"z": 0.0}}, **options})),
+    )
 
 
 def test_edges_that_can_move_and_unknown_surfaces_are_refused(tmp_path):

@@ -1,4 +1,5 @@
-"""A small experiment with pressures through its command line: its stages, its files and recordings that it refuses.
+"""A small experiment with pressures through its command line:
+its stages, its files and recordings that it refuses.
 
 The report has tests of its own.
 """
@@ -32,8 +33,20 @@ from warp_resphys.report.ranking import shown_metrics, unused
 from warp_resphys.robot.description import finished_experiment
 from warp_resphys.settings.stage_keys import StageSettings
 
-COMMAND = ("experiment=tiny", TRACKED, "actuator={epochs: 1, gate: false, centres: 10, filters: [0.05]}")
-STAGES = {"laboratory", "import", "identify", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate"}
+COMMAND = (
+    "experiment=tiny",
+    TRACKED,
+    "actuator={epochs: 1, gate: false, centres: 10, filters: [0.05]}",
+)
+STAGES = {
+    "laboratory",
+    "import",
+    "identify",
+    "reconstruct_resphys",
+    "train_resphys",
+    "train_simfree",
+    "evaluate",
+}
 STAGES |= {"mesh_check", "report", "laboratory_scaled", "import_scaled", "train_actuator"}
 
 
@@ -47,7 +60,8 @@ def finished(tmp_path_factory):
         before = {path: path.stat().st_mtime_ns for path in (folder / "run").rglob("*.h5")}
         finish(*COMMAND, "data.input_scales=[1.5]")
     changed = [path.name for path, at in before.items() if path.stat().st_mtime_ns != at]
-    assert changed == ["rollouts.h5"]  # Nothing but the new trials is simulated again, and nothing learned.
+    # Nothing but the new trials is simulated again, and nothing learned.
+    assert changed == ["rollouts.h5"]
     return folder / "run"
 
 
@@ -78,7 +92,9 @@ def test_every_stage_leaves_its_files_and_the_errors_are_those_of_the_roll_outs(
         first = 1e3 * np.linalg.norm(x[0, :7] - observed[3, :7], axis=-1).mean()
         assert results["horizons"]["0.06"][model]["mean"] == pytest.approx(first, rel=1e-9)
     checked = results["mesh_check"]  # whole trials are shorter than its half second
-    assert checked["errors_mm"][0] == pytest.approx(results["scales"]["1"]["sysid"]["mean"], rel=1e-6)
+    assert checked["errors_mm"][0] == pytest.approx(
+        results["scales"]["1"]["sysid"]["mean"], rel=1e-6
+    )
     assert (checked["trials"], checked["model"]) == (["t003"], "sysid")
     assert checked["cells"][0] < checked["cells"][1]
     assert checked["moved_mm"] > abs(np.subtract(*checked["errors_mm"]))
@@ -90,9 +106,15 @@ def test_without_reconstruction_the_actuator_is_all_that_is_learned(finished, tm
     place_segment(tmp_path)
     with without_reports(), contextlib.chdir(tmp_path):
         finish(*COMMAND, "data.input_scales=[1.5]", "reconstruction=none")
-    results, before = (read_json(folder / "metrics.json") for folder in (tmp_path / "run", finished))
+    results, before = (
+        read_json(folder / "metrics.json") for folder in (tmp_path / "run", finished)
+    )
     assert before["errors_mm"].keys() - results["errors_mm"].keys() == {"simfree"}
-    assert results["errors_mm"]["resphys"] == results["errors_mm"]["actuator"] == before["errors_mm"]["actuator"]
+    assert (
+        results["errors_mm"]["resphys"]
+        == results["errors_mm"]["actuator"]
+        == before["errors_mm"]["actuator"]
+    )
     assert results["networks"].keys() == {"actuator"}
     assert "reconstruction" not in results
     assert warp_resphys.load(tmp_path / "run").description.learned is None
@@ -129,13 +151,22 @@ def test_recordings_are_seen_by_cameras_and_registered_back(finished):
 def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch):
     stage = stage_of(finished, "train_resphys", StageSettings)
     assert stage.force_frame == "corotated"
-    assert read_checkpoint(finished / "resphys.safetensors", "residual force")[1]["force_frame"] == "corotated"
+    assert (
+        read_checkpoint(finished / "resphys.safetensors", "residual force")[1]["force_frame"]
+        == "corotated"
+    )
     learned = {}
     for frame in ("corotated", "world"):
-        keep = lambda network, train, *rest, frame=frame: learned.update({frame: train})  # noqa: E731
+
+        def keep(network, train, *rest, frame=frame):
+            learned[frame] = train
+
         monkeypatch.setattr(fitting, "Trainer", keep)
         experiment = Experiment(stage.model_copy(update={"force_frame": frame}), finished)
-        assert learning_stages.fitting_of(experiment, "resphys").trainer(stage.training)[1].force_frame == frame
+        assert (
+            learning_stages.fitting_of(experiment, "resphys").trainer(stage.training)[1].force_frame
+            == frame
+        )
     turned, kept = (learned[frame] for frame in ("corotated", "world"))
     frames = force_frames(experiment.model_simulator("resphys"), "corotated")
     size = float(kept.outputs[0].abs().max())
@@ -160,7 +191,9 @@ class Recordings:
     def stages(self, *overrides):
         path = f"hydra.searchpath=[file://{self.finished.parent / 'configs'}]"
         split = ("data.train=[t000,t001]", "data.validation=[t002]", "data.test=[t003]")
-        return pipeline.acquisition_stages(settings(path, *COMMAND, f"data.folder={self.folder}", *split, *overrides))
+        return pipeline.acquisition_stages(
+            settings(path, *COMMAND, f"data.folder={self.folder}", *split, *overrides)
+        )
 
     def imported(self, *overrides):
         """The dataset of their import."""
@@ -192,7 +225,10 @@ def stilled(recording):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (pressed(lambda p: np.concatenate([p, p[:, :1]], axis=1)), "t000.h5 has pressures of 3 chambers"),
+        (
+            pressed(lambda p: np.concatenate([p, p[:, :1]], axis=1)),
+            "t000.h5 has pressures of 3 chambers",
+        ),
         (pressed(lambda p: p + 3e4 * (np.arange(len(p)) > 5)[:, None]), "beyond data.input_limit"),
         (pressed(lambda p: p + 1e3), "t000.h5 begins under pressure"),
         (pressed(lambda p: None), "no array 'actuation'"),
@@ -204,7 +240,9 @@ def test_bad_recordings_cost_one_sentence(recordings, change, message):
     assert message in recordings.refused()
 
 
-def test_pressures_in_another_unit_and_two_files_of_one_name_cost_one_sentence(recordings, tmp_path):
+def test_pressures_in_another_unit_and_two_files_of_one_name_cost_one_sentence(
+    recordings, tmp_path
+):
     recordings.write(pressed(lambda p: 1e-3 * p))
     assert "the pressures of all 4 recordings stay below" in recordings.refused()
     (tmp_path / "t001.csv").touch()
@@ -216,25 +254,35 @@ def test_a_short_recording_is_named_and_its_rest_counts_as_not_seen(recordings, 
     recordings.write(lambda recording: recording.frames(slice(11)), "t002")
     seen = np.isfinite(recordings.imported().observed).all(axis=(2, 3))
     assert seen.sum(axis=1).tolist() == [9, 13, 11, 13]
-    said = "shorter than the 12 steps of data.steps (t000.h5: 8, t002.h5: 10); missing frames are ignored"
-    assert [said in record.message for record in caplog.records if record.levelname == "WARNING"] == [True]
+    said = (
+        "shorter than the 12 steps of data.steps (t000.h5: 8, t002.h5: 10); "
+        "missing frames are ignored"
+    )
+    assert [
+        said in record.message for record in caplog.records if record.levelname == "WARNING"
+    ] == [True]
 
 
 def rested(recording, frames=150):
     """A recording that begins with more frames at rest."""
-    positions = np.concatenate([np.repeat(recording.positions[:1], frames, axis=0), recording.positions])
+    positions = np.concatenate(
+        [np.repeat(recording.positions[:1], frames, axis=0), recording.positions]
+    )
     pressures = np.concatenate([np.zeros((frames, 2)), recording.actuation])
     return dataclasses.replace(recording, positions=positions, actuation=pressures)
 
 
-def test_recordings_are_read_whole_without_a_number_of_steps_or_from_where_something_happens(recordings, caplog):
+def test_recordings_are_read_whole_without_a_number_of_steps_or_from_where_something_happens(
+    recordings, caplog
+):
     recordings.write(rested, "t000")
     whole = recordings.imported("data.steps=null")
     seen = np.isfinite(whole.observed).all(axis=(2, 3))
     assert seen.sum(axis=1).tolist() == [163, 13, 13, 13]
     np.testing.assert_array_equal(whole.inputs["pressure"][0, :149], 0.0)
     assert "shorter" not in caplog.text
-    # More frames at rest at their start change nothing; without the lead, nothing happens in the first steps.
+    # More frames at rest at their start change nothing; without the lead, nothing happens in the
+    # first steps.
     expected = recordings.imported("data.lead=0.02")
     recordings.write(rested, "t000", "t003")
     read = recordings.imported("data.lead=0.02")
@@ -246,14 +294,20 @@ def test_recordings_are_read_whole_without_a_number_of_steps_or_from_where_somet
 def exchanged(recording, one="B1", other="B2"):
     """The recording with the labels of two markers on the clamp exchanged."""
     names = {one: other, other: one}
-    return dataclasses.replace(recording, labels=tuple(names.get(label, label) for label in recording.labels))
+    return dataclasses.replace(
+        recording, labels=tuple(names.get(label, label) for label in recording.labels)
+    )
 
 
-def test_the_registration_of_every_trial_is_said_and_markers_that_it_leaves_out_are_warned_of(recordings, caplog):
+def test_the_registration_of_every_trial_is_said_and_markers_that_it_leaves_out_are_warned_of(
+    recordings, caplog
+):
     caplog.set_level("INFO")
     recordings.imported()
     fits = read_json(recordings.folder / "registration.json")
-    lines = [f"import: {name} is registered to {fit['rms_mm']:.2f} mm" for name, fit in fits.items()]
+    lines = [
+        f"import: {name} is registered to {fit['rms_mm']:.2f} mm" for name, fit in fits.items()
+    ]
     assert [record.message for record in caplog.records if "registered" in record.message] == lines
     assert [record for record in caplog.records if record.levelname == "WARNING"] == []
     recordings.write(exchanged)
@@ -275,28 +329,40 @@ def test_constant_inputs_are_pulses(recordings):
     others = ", ".join(f"{name}: {name}.h5" for name in ("t001", "t002", "t003"))
     trials = f"+data.trials={{{pulse}, {others}}}"
     pressure = recordings.imported(trials).inputs["pressure"][0]
-    np.testing.assert_allclose(pressure[:, 0], 1e4 * np.array([0, 0, 0.5, 1, 1, 1, 0, 0, 0, 0, 0, 0]), atol=1e-6)
+    np.testing.assert_allclose(
+        pressure[:, 0], 1e4 * np.array([0, 0, 0.5, 1, 1, 1, 0, 0, 0, 0, 0, 0]), atol=1e-6
+    )
     np.testing.assert_array_equal(pressure[:, 1], 0.0)
     with pytest.raises(ResphysError, match=r"t000.until is 0.02: it must be above onset, 0.025 s"):
         recordings.stages(trials, "data.trials.t000.until=0.02")
-    with pytest.raises(ResphysError, match=r"t000.inputs is null: onset and until are of constant inputs"):
+    with pytest.raises(
+        ResphysError, match=r"t000.inputs is null: onset and until are of constant inputs"
+    ):
         recordings.stages(trials, "data.trials.t000.inputs=null")
 
 
-def test_a_robot_has_the_learned_actuator_as_evaluated_from_a_file_and_on_another_mesh(finished, tmp_path):
+def test_a_robot_has_the_learned_actuator_as_evaluated_from_a_file_and_on_another_mesh(
+    finished, tmp_path
+):
     robot = warp_resphys.load(finished, "actuator")
     trial = warp_resphys.recorded_trial(robot, "t003")
     shown = trial.shown(trial.play(robot))
     with read_hdf5(finished / "rollouts.h5", "rollouts") as file:
-        expected, below = (read_array(file, f"{model}_observed")[0] for model in ("actuator", "sysid"))
+        expected, below = (
+            read_array(file, f"{model}_observed")[0] for model in ("actuator", "sysid")
+        )
     np.testing.assert_allclose(shown, expected, atol=1e-7)
     assert np.abs(expected - below).max() > 1e-5
     again = warp_resphys.load(robot.save(tmp_path / "robot.safetensors"))
     np.testing.assert_allclose(trial.shown(trial.play(again)), shown, atol=1e-9)
     other = robot.on(robot.description.mesh)
     pressed = {"pressure": [5e3, 0.0]}
-    torch.testing.assert_close(other.settle(**pressed).q, robot.settle(**pressed).q, rtol=0.0, atol=1e-8)
-    assert (other.settle(**pressed).q - robot.on(robot.description.mesh, chambers=None).settle().q).abs().max() > 1e-6
+    torch.testing.assert_close(
+        other.settle(**pressed).q, robot.settle(**pressed).q, rtol=0.0, atol=1e-8
+    )
+    assert (
+        other.settle(**pressed).q - robot.on(robot.description.mesh, chambers=None).settle().q
+    ).abs().max() > 1e-6
 
 
 @pytest.mark.parametrize(
@@ -306,7 +372,10 @@ def test_a_robot_has_the_learned_actuator_as_evaluated_from_a_file_and_on_anothe
         ["experiment=sopra_overpressure", "budget=quick"],
         ["in_the_loop={epochs:5}", "parallel.batch=null", "range_guard=false", "timing=true"],
         ["data.begins=static"],
-        ["data.payload_at={z: -0.276, tolerance: 1e-6}", "+laboratory.trials.t000={payload: 0.02, begins: static}"],
+        [
+            "data.payload_at={z: -0.276, tolerance: 1e-6}",
+            "+laboratory.trials.t000={payload: 0.02, begins: static}",
+        ],
     ],
 )
 def test_what_the_pipeline_has_for_others_goes_with_pressures(overrides):
@@ -319,7 +388,8 @@ def test_the_configuration_of_recordings_with_pressures_is_accepted(tmp_path):
     check(composed("experiment=segment_real", f"data.folder={tmp_path}"))
     for name in ("sopra", "segment_real", "beam_real"):
         chosen = composed(f"experiment={name}", "reconstruction=lbfgsb")["reconstruction"]
-        assert (chosen["method"], chosen["regularisation"]) == ("lbfgsb", 1e-4)  # a method is taken as a whole
+        # a method is taken as a whole
+        assert (chosen["method"], chosen["regularisation"]) == ("lbfgsb", 1e-4)
 
 
 def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported():
@@ -327,12 +397,21 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported():
     good, lost = observed + np.array([3e-3, 0.0, 4e-3]), observed.copy()
     lost[1, 3:] = np.nan
     left = {"resphys": np.array([-1, 3])}
-    about = (np.tile(0.01 * np.arange(5), (2, 1)), observed, observed[:, 0], np.zeros(2), np.zeros(3), 0.01)
+    about = (
+        np.tile(0.01 * np.arange(5), (2, 1)),
+        observed,
+        observed[:, 0],
+        np.zeros(2),
+        np.zeros(3),
+        0.01,
+    )
     pressed = {"pressure": np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 0.0, 0.0]])[..., None]}
     more = {"bound": np.zeros((1, 3)), "inputs": pressed}
     motions = ObservedMotions(Trials(("a", "b"), ("m",), ("rest", "rest"), *about, **more))
     markers = {"sysid": good, "resphys": lost}
-    results = ComparedModels(motions, (), {"1": ("a", "b")}, markers, left, horizons=(0.02, 0.04)).errors()
+    results = ComparedModels(
+        motions, (), {"1": ("a", "b")}, markers, left, horizons=(0.02, 0.04)
+    ).errors()
     assert results["errors_mm"]["sysid"]["mean"] == pytest.approx(5.0)
     assert results["errors_mm"]["resphys"]["diverged"] == 1
     assert results["range"]["resphys"] == {"left": 1, "first_s": {"b": pytest.approx(0.03)}}
@@ -344,19 +423,26 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported():
 
 
 def test_the_spread_of_predicted_markers_is_that_of_draws_of_the_parameters(finished):
-    """The stored variance beside roll-outs with parameters that are drawn from a narrowed posterior."""
+    """The stored variance beside roll-outs with parameters
+    that are drawn from a narrowed posterior.
+    """
     experiment = Experiment(stage_of(finished, "evaluate", StageSettings), finished)
     identified = experiment.identified("sysid")
     names, uncertainty = [*identified.parameters], identified.uncertainty
     deviation = 1e-3 * np.array([uncertainty.deviation[name] for name in names])
     covariance = np.array(uncertainty.correlation) * np.outer(deviation, deviation)
-    ranges = np.diag([12.0 / uncertainty.ranges[name] ** 2 for name in names])  # variances of uniform distributions
+    # Variances of uniform distributions.
+    ranges = np.diag([12.0 / uncertainty.ranges[name] ** 2 for name in names])
     covariance = 1e-6 * np.linalg.inv(np.linalg.inv(1e6 * covariance) + ranges)
     means = [*identified.parameters.values()]
     drawn = np.random.default_rng(0).multivariate_normal(means, covariance, 400)
-    replay = experiment.motions.replay(experiment.model_simulator("sysid"), ["t003"], experiment.identified("sysid"))
+    replay = experiment.motions.replay(
+        experiment.model_simulator("sysid"), ["t003"], experiment.identified("sysid")
+    )
     sets = {name: torch.from_numpy(drawn[:, column].copy()) for column, name in enumerate(names)}
-    points = replay.varied(experiment.motions.start(replay, experiment.identified("sysid")), sets)[0][:, 0].numpy()
+    points = replay.varied(experiment.motions.start(replay, experiment.identified("sysid")), sets)[
+        0
+    ][:, 0].numpy()
     with read_hdf5(finished / "rollouts.h5", "rollouts") as file:
         stored = read_array(file, "sysid_spread")[0]
         corrected = [read_array(file, f"{model}_spread")[0] for model in ("actuator", "resphys")]

@@ -1,4 +1,6 @@
-"""Experiments with recordings that others have published, read from the files as their owners left them."""
+"""Experiments with recordings that others have published,
+read from the files as their owners left them.
+"""
 
 import numpy as np
 import pytest
@@ -43,13 +45,18 @@ def test_the_segment_is_inflated_when_its_markers_say_so_and_emptied_again(impor
 
 
 def test_each_chamber_of_the_real_arm_bends_it_away_from_its_side(imported):
-    """Columns of pressures belong to the chambers, and recorded axes to those of the body, as the experiment says."""
+    """Columns of pressures belong to the chambers, and recorded axes to those of the body,
+    as the experiment says.
+    """
     run, trials = imported("sopra_real")
     mesh = build_body(run).mesh
     seen = np.isfinite(trials.observed[:, 1:, 0]).all(-1)
     tips = trials.observed[:, 1:, 0][seen]  # (F, 3)
     assert tips.mean(0)[2] == pytest.approx(-0.25, abs=0.02)
-    held = [lfilter([0.3], [1.0, -0.7], trials.inputs["pressure"], axis=1)[seen], np.ones((len(tips), 1))]
+    held = [
+        lfilter([0.3], [1.0, -0.7], trials.inputs["pressure"], axis=1)[seen],
+        np.ones((len(tips), 1)),
+    ]
     bends = np.linalg.lstsq(np.concatenate(held, 1), tips[:, :2], rcond=None)[0]
     for chamber, bend in zip(find_chambers(mesh), bends, strict=False):
         side = (mesh.vertices[np.unique(chamber.faces)].mean(0) - mesh.vertices.mean(0))[:2]

@@ -1,4 +1,5 @@
-"""A beam of two silicones with a rigid cap, from YAML: identified by region, corrected, and taken along as a robot.
+"""A beam of two silicones with a rigid cap, from YAML:
+identified by region, corrected, and taken along as a robot.
 
 Motion capture sees the pose of the cap alone, on which its rigid body is mounted in any way.
 """
@@ -17,10 +18,17 @@ from warp_resphys.robot.description import Description, describe
 from warp_resphys.twin.stream import recorded_packets
 
 TINY = [
-    *("experiment=beam_regions", "budget=quick", "mesh.divisions=[10,1,1]", "laboratory.mesh.divisions=[10,1,1]"),
-    *("laboratory.time_step=0.005", "laboratory.integrator=bdf2", "laboratory.material.model=corotated"),
+    "experiment=beam_regions",
+    "budget=quick",
+    "mesh.divisions=[10,1,1]",
+    "laboratory.mesh.divisions=[10,1,1]",
+    "laboratory.time_step=0.005",
+    "laboratory.integrator=bdf2",
+    "laboratory.material.model=corotated",
     *("laboratory.material.poissons_ratio=0.499", "laboratory.material.mass_damping=0"),
-    *("laboratory.material.regions.root.youngs_modulus=350e3", "laboratory.seconds=0.4", "laboratory.noise=1e-6"),
+    "laboratory.material.regions.root.youngs_modulus=350e3",
+    "laboratory.seconds=0.4",
+    "laboratory.noise=1e-6",
     *("laboratory.placement_noise=1e-6", "laboratory.tilt=0", "laboratory.train=[m0,m80]"),
     *("laboratory.validation=[m20]", "laboratory.test=[m50]", "laboratory.orientation_noise=0.05"),
     *("data.seconds=0.3", "data.limit=null", "identify.substeps=2", "identify.max_evaluations=10"),
@@ -72,8 +80,13 @@ def test_positions_and_orientations_have_their_own_errors_as_robots_count_them(f
     ]
     assert metrics["errors_mm"]["sysid"]["mean"] == pytest.approx(1e3 * np.nanmean(away))
     assert metrics["per_marker"]["sysid"] == {"plate": pytest.approx(1e3 * np.nanmean(away))}
-    assert metrics["orientations_deg"]["sysid"]["plate"] == pytest.approx(np.degrees(np.mean(turned)))
-    assert metrics["orientations_deg"]["sysid"]["plate"] < 0.3 * metrics["orientations_deg"]["simulation"]["plate"]
+    assert metrics["orientations_deg"]["sysid"]["plate"] == pytest.approx(
+        np.degrees(np.mean(turned))
+    )
+    assert (
+        metrics["orientations_deg"]["sysid"]["plate"]
+        < 0.3 * metrics["orientations_deg"]["simulation"]["plate"]
+    )
     robot = warp_resphys.load(folder, "sysid")
     assert "vertices, 1 rigid body, steps" in repr(robot)
     trial = warp_resphys.recorded_trial(robot, "m50")
@@ -86,7 +99,11 @@ def test_a_robot_takes_its_regions_along(folder):
     described = describe(folder, "sysid")
     described.write(folder / "robot.safetensors")
     results = Description.read(folder / "robot.safetensors")
-    assert {name: len(cells) for name, cells in results.mesh.regions.items()} == {"root": 5, "tip": 4, "cap": 1}
+    assert {name: len(cells) for name, cells in results.mesh.regions.items()} == {
+        "root": 5,
+        "tip": 4,
+        "cap": 1,
+    }
     robot = warp_resphys.load(folder / "robot.safetensors")
     packet = next(recorded_packets(robot, folder / "recordings" / "m50.h5"))
     assert {*robot.labels} < {*packet.markers}

@@ -1,4 +1,6 @@
-"""Experiments on recordings through the command line, synthetic or of a folder, to the errors of all models."""
+"""Experiments on recordings through the command line,
+synthetic or of a folder, to the errors of all models.
+"""
 
 import shutil
 
@@ -63,7 +65,15 @@ FOLDS = [
     "identify.elastic=null",
     "in_the_loop.epochs=1",
 ]
-STAGES = ["identify", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate", "mesh_check", "report"]
+STAGES = [
+    "identify",
+    "reconstruct_resphys",
+    "train_resphys",
+    "train_simfree",
+    "evaluate",
+    "mesh_check",
+    "report",
+]
 
 
 @pytest.fixture(scope="module")
@@ -74,21 +84,44 @@ def finished(tmp_path_factory):
 class TestCompleteRun:
     def test_files_are_complete_and_films_have_whole_steps(self, finished):
         names = {path.name for path in finished.iterdir()}
-        trained = {name for model in TRAINED for name in (f"{model}.safetensors", f"training_{model}.json")}
-        assert names >= {"truth.json", "quality.json", "registration.json", "reconstruction_resphys.h5", *trained}
-        assert {path.stem for path in (finished / "recordings").iterdir()} == {"m0", "m20", "m50", "m80"}
-        assert {path.stem for path in (finished / "stages").iterdir()} == {"laboratory", "import", *STAGES}
-        for model, kind, name in (("simfree", NextState, "next state"), ("resphys", ResidualForce, "residual force")):
+        trained = {
+            name for model in TRAINED for name in (f"{model}.safetensors", f"training_{model}.json")
+        }
+        assert names >= {
+            "truth.json",
+            "quality.json",
+            "registration.json",
+            "reconstruction_resphys.h5",
+            *trained,
+        }
+        assert {path.stem for path in (finished / "recordings").iterdir()} == {
+            "m0",
+            "m20",
+            "m50",
+            "m80",
+        }
+        assert {path.stem for path in (finished / "stages").iterdir()} == {
+            "laboratory",
+            "import",
+            *STAGES,
+        }
+        for model, kind, name in (
+            ("simfree", NextState, "next state"),
+            ("resphys", ResidualForce, "residual force"),
+        ):
             restored = restore(kind, *read_checkpoint(finished / f"{model}.safetensors", name))
-            assert (restored.actuation is None) == (model != "simfree")  # in_the_loop.sees_payload is false
+            # in_the_loop.sees_payload is false
+            assert (restored.actuation is None) == (model != "simfree")
         with read_hdf5(finished / "rollouts.h5", "rollouts") as file:
             assert list(file.attrs["names"]) == ["m50"]
             films = {file[f"{model}_film"].shape for model in MODELS}
             assert (str(file.attrs["film_trial"]), file.attrs["time_step"]) == ("m50", 0.01)
             np.testing.assert_array_equal(file["film_steps"], np.arange(len(file["film_steps"])))
             fall = file["sysid_film"][2, -1, 2] - file["sysid_film"][0, -1, 2]
-        assert fall == pytest.approx(-0.5 * 9.80709 * 0.02**2, rel=0.15)  # freely at first; by half steps
-        assert films == {(8, 20, 3)}  # the whole steps of 0.01 s up to the last frame, which comes before 0.08 s
+        # Freely at first; by half steps.
+        assert fall == pytest.approx(-0.5 * 9.80709 * 0.02**2, rel=0.15)
+        # The whole steps of 0.01 s up to the last frame, which comes before 0.08 s.
+        assert films == {(8, 20, 3)}
 
     def test_identification(self, finished):
         results = read_json(finished / "identification.json")
@@ -110,11 +143,14 @@ class TestCompleteRun:
         assert [trial["name"] for trial in results["per_trajectory"]] == ["m50"]
         assert results["parameters"].keys() == {"sysid", "sysid_elastic"}
         assert 0.0 < results["sideways_mm"]["m50"] < 0.5  # The simulated beam is held straight.
-        assert results["noise_mm"] == pytest.approx(0.05 * np.sqrt(8.0 / np.pi), rel=0.05)  # Maxwell's distribution
+        # Maxwell's distribution
+        assert results["noise_mm"] == pytest.approx(0.05 * np.sqrt(8.0 / np.pi), rel=0.05)
         for model, markers in results["per_marker"].items():
             assert np.mean(list(markers.values())) == pytest.approx(errors[model])
 
-    def test_training_begins_without_a_force_and_the_reconstruction_says_how_close_it_came(self, finished):
+    def test_training_begins_without_a_force_and_the_reconstruction_says_how_close_it_came(
+        self, finished
+    ):
         training = read_json(finished / "training_resphys.json")
         first, *others = training["epochs"]
         assert [record["epoch"] for record in training["epochs"]] == [0, 1, 2]
@@ -145,10 +181,16 @@ def test_the_error_of_a_mesh_that_cannot_be_refined_is_not_known(finished, tmp_p
     given["mesh"] = {"kind": "file", "path": str(tmp_path / "beam.vtk")}
     check_mesh(StageContext("mesh_check", tmp_path, "", parse(StageSettings, given)))
     text = mesh_text(read_json(tmp_path / "mesh_check.json"))
-    assert text.startswith("The error of the mesh is not known: its cells are given, and quadratic already")
+    assert text.startswith(
+        "The error of the mesh is not known: its cells are given, and quadratic already"
+    )
     linear = {"model": "sysid", "cells": [24, 24], "vertices": [63, 325], "trials": ["m50"]}
-    text = mesh_text(linear | {"errors_mm": [0.6, 1.16], "moved_mm": 1.161}).replace(NO_BREAK_SPACE, " ")
-    assert text.startswith("With quadratic cells (325 instead of 63 vertices) and the same parameters, SysID moves")
+    text = mesh_text(linear | {"errors_mm": [0.6, 1.16], "moved_mm": 1.161}).replace(
+        NO_BREAK_SPACE, " "
+    )
+    assert text.startswith(
+        "With quadratic cells (325 instead of 63 vertices) and the same parameters, SysID moves"
+    )
     assert "by 1.16 mm, and its error is 1.16 mm instead of 0.600 mm" in text
 
 
@@ -176,7 +218,9 @@ def test_folds_each_of_which_is_a_robot(finished, tmp_path):
     assert shown["folds"] == {trial: fold["errors_mm"] for trial, fold in results["folds"].items()}
 
 
-def test_an_interrupted_identification_goes_on_with_the_next_search(finished, tmp_path, monkeypatch):
+def test_an_interrupted_identification_goes_on_with_the_next_search(
+    finished, tmp_path, monkeypatch
+):
     """The searches are replaced: they return their starts."""
     shutil.copy(finished / "dataset.h5", tmp_path)
     wanted = settings(*SYNTHETIC, "identify.starts=2")
@@ -194,8 +238,10 @@ def test_an_interrupted_identification_goes_on_with_the_next_search(finished, tm
         run_stages([stage], tmp_path)
     assert not (tmp_path / "identification.json").exists()
     run_stages([stage], tmp_path)
-    own = [(name, number) for name in ("midpoint", "implicit_euler") for number in (0, 1, 0)]  # The release again.
+    # The release again.
+    own = [(name, number) for name in ("midpoint", "implicit_euler") for number in (0, 1, 0)]
     assert descents == [*own[:4], *own[3:]]  # The first two searches are kept.
     history = read_json(tmp_path / "identification.json")["sysid"]["history"]
-    assert list(map(len, history)) == [2, 1]  # The search after the release was estimated again continues the best.
+    # The search after the release was estimated again continues the best.
+    assert list(map(len, history)) == [2, 1]
     assert not list(tmp_path.glob("identify_*"))

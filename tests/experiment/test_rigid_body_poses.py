@@ -1,4 +1,6 @@
-"""A rigid body on a hanging cap: its mounting follows from the pose of its part, and is refused where none shows it."""
+"""A rigid body on a hanging cap: its mounting follows from the pose of its part,
+and is refused where none shows it.
+"""
 
 from dataclasses import replace
 
@@ -19,15 +21,25 @@ from warp_resphys.pipeline import acquisition_stages
 # The laboratory is the simulator, so that the cap hangs where the import expects it.
 HANGS = [
     *("experiment=beam_regions", "~markers.tracked", "markers.rigid_bodies={plate: {part: cap}}"),
-    *("mesh.divisions=[10,1,1]", "laboratory.mesh.divisions=[10,1,1]", "simulation.youngs_modulus=100e3"),
-    "laboratory.material={model: corotated, youngs_modulus: 100e3, poissons_ratio: 0.499, density: 1070.0}",
+    "mesh.divisions=[10,1,1]",
+    "laboratory.mesh.divisions=[10,1,1]",
+    "simulation.youngs_modulus=100e3",
+    "laboratory.material={model: corotated, youngs_modulus: 100e3, poissons_ratio: 0.499, "
+    "density: 1070.0}",
     "laboratory.material.regions={root: {}, tip: {youngs_modulus: 100e3}}",
     "simulation.regions={root: {}, tip: {youngs_modulus: 100e3}}",
-    *("laboratory.noise=1e-7", "laboratory.placement_noise=0", "laboratory.tilt=0", "laboratory.validation=[]"),
+    "laboratory.noise=1e-7",
+    "laboratory.placement_noise=0",
+    "laboratory.tilt=0",
+    "laboratory.validation=[]",
     "laboratory.trials={p0: {begins: static}, p30: {begins: static, payload: 0.03}}",
 ]
 SPLIT = ("laboratory.train=[p0]", "laboratory.test=[p30]")
-BASES = {"Base - 1": [0.006, -0.01, -0.001], "Base - 2": [0.006, 0.04, 0.0275], "Base - 3": [0.006, 0.04, 0.0]}
+BASES = {
+    "Base - 1": [0.006, -0.01, -0.001],
+    "Base - 2": [0.006, 0.04, 0.0275],
+    "Base - 3": [0.006, 0.04, 0.0],
+}
 
 
 def imported(folder, *overrides):
@@ -50,14 +62,24 @@ def test_a_hanging_part_shows_the_mounting(tmp_path):
 
 
 def test_a_mounting_that_no_trial_shows_is_refused(tmp_path):
-    loaded = "laboratory.trials={p20: {begins: static, payload: 0.02}, p30: {begins: static, payload: 0.03}}"
-    with pytest.raises(InputError, match=r"rigid_bodies\.plate: its mounting on the body is unknown, as no trial"):
+    loaded = (
+        "laboratory.trials={p20: {begins: static, payload: 0.02}, "
+        "p30: {begins: static, payload: 0.03}}"
+    )
+    with pytest.raises(
+        InputError, match=r"rigid_bodies\.plate: its mounting on the body is unknown, as no trial"
+    ):
         imported(tmp_path, loaded, "laboratory.train=[p20]", "laboratory.test=[p30]")
 
 
-@pytest.mark.parametrize(("angle", "train", "test"), [(120.0, "p0", "other"), (5.0, "p0, other", "p30")])
+@pytest.mark.parametrize(
+    ("angle", "train", "test"), [(120.0, "p0", "other"), (5.0, "p0, other", "p30")]
+)
 def test_a_rigid_body_that_was_remounted_is_refused(tmp_path, angle, train, test):
-    """By 120 degrees in a test trial; by 5 degrees, 5 mm at its points, between two trials of the training."""
+    """By 120 degrees in a test trial.
+
+    By 5 degrees, 5 mm at its points, between two trials of the training.
+    """
     imported(tmp_path / "played", *SPLIT)
     recording = read_recording(tmp_path / "played" / "recordings" / "p0.h5")
     positions = recording.positions.copy()
@@ -67,10 +89,15 @@ def test_a_rigid_body_that_was_remounted_is_refused(tmp_path, angle, train, test
     positions[:, arms] = place + (positions[:, arms] - place) @ turn.T
     write_recording(tmp_path / "p0.h5", recording)
     write_recording(tmp_path / "other.h5", replace(recording, positions=positions))
-    write_recording(tmp_path / "p30.h5", read_recording(tmp_path / "played" / "recordings" / "p30.h5"))
+    write_recording(
+        tmp_path / "p30.h5", read_recording(tmp_path / "played" / "recordings" / "p30.h5")
+    )
     trials = "p0: {file: p0.h5, begins: static}, other: {file: other.h5, begins: static}"
     given = f"data.trials={{{trials}, p30: {{file: p30.h5, begins: static, payload: 0.03}}}}"
-    message = rf"other\.h5: 'plate' is 0\.0 mm and {angle} degrees from its mounting in p0\.h5: where it was remounted"
+    message = (
+        rf"other\.h5: 'plate' is 0\.0 mm and {angle} degrees from its mounting in p0\.h5: "
+        "where it was remounted"
+    )
     with pytest.raises(InputError, match=message):
         imported(tmp_path, given, *recorded(tmp_path, train, test))
 
@@ -85,5 +112,7 @@ def test_a_rest_without_an_orientation_is_refused(tmp_path):
         np.savez(tmp_path / f"{name}.npz", labels=[*places], rate_hz=100.0, **own)
     trials = "data.trials={a: {file: a.npz, begins: released}, b: {file: b.npz, begins: released}}"
     options = (trials, "data.rest=file", "data.seconds=0.1", "release.sideways=0")
-    with pytest.raises(DataFileError, match=r"a\.npz: 'rest' has no orientation of 'plate': set data\.rest to held"):
+    with pytest.raises(
+        DataFileError, match=r"a\.npz: 'rest' has no orientation of 'plate': set data\.rest to held"
+    ):
         imported(tmp_path, *options, *recorded(tmp_path, "a", "b"))

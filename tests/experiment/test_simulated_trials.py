@@ -1,4 +1,6 @@
-"""The simulation that plays the real body: its own mesh, steps and actuators, and the trials that a budget picks."""
+"""The simulation that plays the real body: its own mesh, steps and actuators,
+and the trials that a budget picks.
+"""
 
 from pathlib import Path
 
@@ -8,7 +10,16 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.configured import check, composed, settings
-from warp_resphys import Body, InputError, Inputs, Muscles, Simulator, box_hexahedra, box_tetrahedra, select_vertices
+from warp_resphys import (
+    Body,
+    InputError,
+    Inputs,
+    Muscles,
+    Simulator,
+    box_hexahedra,
+    box_tetrahedra,
+    select_vertices,
+)
 from warp_resphys.data.base_motion import rigid
 from warp_resphys.data.trials import Trials
 from warp_resphys.energies import Muscle, make_material
@@ -28,7 +39,8 @@ OWN = (
     "target.mesh={kind:box_hexahedra,size:[0.1,0.03,0.03],divisions:[8,4,4]}",
     "target.time_step=0.005",
     "target.integrator=bdf2",
-    "target.material={model:stable_neo_hookean,youngs_modulus:264e3,poissons_ratio:0.45,density:1070.0}",
+    "target.material={model:stable_neo_hookean,youngs_modulus:264e3,poissons_ratio:0.45,"
+    "density:1070.0}",
     "target.muscles={bundles:{along:{direction:[1,0,0]}},stiffness:80e3,toe:0.02}",
 )
 COARSE = ("mesh={kind:box_hexahedra,size:[0.1,0.03,0.03],divisions:[4,2,2]}", "data.steps=3")
@@ -38,7 +50,13 @@ def test_keys_that_are_left_out_are_those_of_the_simulator_and_a_law_is_a_model_
     run = settings("experiment=beam_oscillation", "integrator=bdf2", "time_step=0.02")
     target = run.target
     parameters = target.material.values  # directly in the group, as beam_oscillation has them
-    assert [*parameters] == ["youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping"]
+    assert [*parameters] == [
+        "youngs_modulus",
+        "poissons_ratio",
+        "density",
+        "mass_damping",
+        "stiffness_damping",
+    ]
     assert parameters["youngs_modulus"] == 264e3
     assert (target.mesh, target.integrator, target.time_step) == (run.mesh, "bdf2", 0.02)
 
@@ -47,26 +65,43 @@ def test_keys_that_are_left_out_are_those_of_the_simulator_and_a_law_is_a_model_
     fibres = settings("experiment=sopra_fibres", "~laboratory.fibres")
     assert fibres.laboratory.fibres == fibres.fibres != None  # noqa: E711
     assert settings("experiment=sopra_fibres", "laboratory.fibres=null").laboratory.fibres is None
-    out = ["~law", *(f"~simulation.{name}" for name in ("youngs_modulus", "poissons_ratio", "stiffness_damping"))]
+    out = [
+        "~law",
+        *(
+            f"~simulation.{name}"
+            for name in ("youngs_modulus", "poissons_ratio", "stiffness_damping")
+        ),
+    ]
     law = "simulation={model:law,c10:40e3,bulk_1:2e6,ogden_m3:5e3,shear_viscosity:20.0}"
     run = settings(*COARSE, *out, law)
     material = build_simulator(run, run.simulation).materials[""]
     assert (material.ogden, material.shear_viscosity, material.density) == ({-3: 5e3}, 20.0, 1070.0)
-    with pytest.raises(InputError, match="simulation: fibres has fibre_tension_1: give each family"):
+    with pytest.raises(
+        InputError, match="simulation: fibres has fibre_tension_1: give each family"
+    ):
         check(composed(*COARSE, *out, law.replace("}", ",fibre_tension_1:1e3}")))
 
 
 @pytest.mark.parametrize(
-    ("mesh", "degree"), [(box_hexahedra(SIZE, (3, 1, 2), 27), 2), (box_tetrahedra(SIZE, (3, 1, 2)), 1)]
+    ("mesh", "degree"),
+    [(box_hexahedra(SIZE, (3, 1, 2), 27), 2), (box_tetrahedra(SIZE, (3, 1, 2)), 1)],
 )
 def test_fields_of_the_degree_of_the_cells_are_interpolated_exactly(mesh, degree):
     other = box_hexahedra(SIZE, (5, 3, 3)).vertices
-    powers = [(i, j, k) for i in range(3) for j in range(3) for k in range(3) if i + j + k <= degree]
+    powers = [
+        (i, j, k) for i in range(3) for j in range(3) for k in range(3) if i + j + k <= degree
+    ]
     shape = np.random.default_rng(0).normal(size=(len(powers), 3))
-    field = lambda x: sum(np.prod((x / 0.1) ** p, axis=1)[:, None] * c for p, c in zip(powers, shape, strict=True))  # noqa: E731
+
+    def field(x):
+        monomials = [np.prod((x / 0.1) ** power, axis=1)[:, None] for power in powers]
+        return sum(m * c for m, c in zip(monomials, shape, strict=True))
+
     seen = vertices_in(mesh, box_hexahedra(SIZE, (5, 3, 3)))
     values = torch.as_tensor(np.stack([field(mesh.vertices), 2.0 * field(mesh.vertices)]))
-    np.testing.assert_allclose(seen(values), np.stack([field(other), 2.0 * field(other)]), atol=1e-12)
+    np.testing.assert_allclose(
+        seen(values), np.stack([field(other), 2.0 * field(other)]), atol=1e-12
+    )
 
 
 def simulated(folder, *overrides):
@@ -78,12 +113,18 @@ def simulated(folder, *overrides):
 
 
 def by_hand(weight, steps):
-    """Motion of the target of `OWN` at every one of its steps, (T + 1, N, 3) positions and velocities."""
+    """Motion of the target of `OWN` at every one of its steps, (T + 1, N, 3) positions and
+    velocities.
+    """
     mesh = box_hexahedra(SIZE, (8, 4, 4))
     muscles = Muscles([Muscle(np.arange(len(mesh.cells)), (1.0, 0.0, 0.0))], 80e3, toe=0.02)
     body = Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=(muscles,))
-    material = make_material("stable_neo_hookean", youngs_modulus=264e3, poissons_ratio=0.45, density=1070.0)
-    simulator = Simulator(body, material, time_step=0.005, gravity=(0.0, 0.0, -9.80709), integrator="bdf2")
+    material = make_material(
+        "stable_neo_hookean", youngs_modulus=264e3, poissons_ratio=0.45, density=1070.0
+    )
+    simulator = Simulator(
+        body, material, time_step=0.005, gravity=(0.0, 0.0, -9.80709), integrator="bdf2"
+    )
     face = select_vertices(mesh, x=0.1)
     force = torch.zeros(1, len(mesh.vertices), 3, dtype=torch.float64)
     force[:, face, 2] = -9.80709 * weight / len(face)
@@ -97,12 +138,19 @@ def test_the_data_are_the_motion_of_the_target_at_the_simulators_vertices_and_st
     dataset, run = simulated(tmp_path, *COARSE, *OWN, weights)
     mesh, q, v = by_hand(0.2, 6)
     vertices = build_body(run).mesh.vertices
-    at = [int(np.argmin(np.linalg.norm(mesh.vertices - x, axis=1))) for x in vertices]  # the meshes are nested
+    # The meshes are nested.
+    at = [int(np.argmin(np.linalg.norm(mesh.vertices - x, axis=1))) for x in vertices]
     np.testing.assert_allclose(dataset.observed[2], q[::2, at], atol=1e-8)
     np.testing.assert_allclose(dataset.velocity[2], v[::2, at], atol=1e-5)
     assert np.abs(np.diff(dataset.observed[2], axis=0)).max(axis=(1, 2)).min() > 1e-3
     assert (dataset.time_step, dataset.times[2, -1]) == (0.01, pytest.approx(0.03))
-    run = settings("experiment=marker_ablation", *COARSE, *OWN, "data.weights_g.observed=[200]", "ablation.counts=[4]")
+    run = settings(
+        "experiment=marker_ablation",
+        *COARSE,
+        *OWN,
+        "data.weights_g.observed=[200]",
+        "ablation.counts=[4]",
+    )
     own = StageSettings.reading(run, *SIMULATOR, "target", "simulation", "data")
     generate_motion(StageContext("generate", tmp_path, "fingerprint", own))
     seen, uncorrected = read_motion(tmp_path)
@@ -120,7 +168,9 @@ def test_the_base_moves_in_the_steps_of_the_target(tmp_path):
     clamp = body.mesh.vertices[body.fixed_vertices]
     for row in range(3):
         moved = rigid(dataset.base[row]).apply(np.broadcast_to(clamp, (5, *clamp.shape)))
-        np.testing.assert_allclose(dataset.observed[row][1:, body.fixed_vertices], moved[1:], atol=1e-12)
+        np.testing.assert_allclose(
+            dataset.observed[row][1:, body.fixed_vertices], moved[1:], atol=1e-12
+        )
     assert np.abs(dataset.base[2, 1:]).max() > 1e-3
 
 
@@ -139,7 +189,10 @@ TWISTED = [
     "experiment=beam_twist",
     "mesh.divisions=[4,2,2]",
     "data.steps=12",
-    *(f"data.angles_deg.{split}={list(angles)}".replace(" ", "") for split, angles in ANGLES.items()),
+    *(
+        f"data.angles_deg.{split}={list(angles)}".replace(" ", "")
+        for split, angles in ANGLES.items()
+    ),
 ]
 
 
@@ -154,15 +207,21 @@ def test_the_beam_is_let_go_from_cross_sections_turned_rigidly_by_the_configured
     for angle, start in zip(angles, q[:, 0], strict=True):
         for x in np.unique(rest[:, 0]):
             section = rest[:, 0] == x
-            turn = Rotation.from_rotvec([angle * x / 0.1, 0.0, 0.0], degrees=True)  # right-handed about x
-            np.testing.assert_allclose(start[section], centre + turn.apply(rest[section] - centre), atol=1e-15)
+            # Right-handed about x.
+            turn = Rotation.from_rotvec([angle * x / 0.1, 0.0, 0.0], degrees=True)
+            np.testing.assert_allclose(
+                start[section], centre + turn.apply(rest[section] - centre), atol=1e-15
+            )
     clamp = rest[:, 0] == 0.0
-    np.testing.assert_array_equal(q[:, :, clamp], np.broadcast_to(rest[clamp], q[:, :, clamp].shape))
+    np.testing.assert_array_equal(
+        q[:, :, clamp], np.broadcast_to(rest[clamp], q[:, :, clamp].shape)
+    )
     assert np.abs(q[:, -1] - q[:, 0]).max((1, 2)).min() > 1e-3  # every beam swings back
 
 
 @pytest.mark.parametrize(
-    ("experiment", "unit", "factor"), [(["experiment=beam_twist"], "°", np.pi / 180.0), (["~data.others"], " g", 1e-3)]
+    ("experiment", "unit", "factor"),
+    [(["experiment=beam_twist"], "°", np.pi / 180.0), (["~data.others"], " g", 1e-3)],
 )
 def test_the_quick_budget_picks_evenly(experiment, unit, factor):
     runs = [settings(*experiment, f"budget={budget}") for budget in ("full", "quick")]
@@ -180,5 +239,6 @@ def test_the_quick_budget_picks_evenly(experiment, unit, factor):
         places = [row.index(one) for one in picked]
         assert len(picked) == limit < len(row)
         assert limit == 1 or [places[0], places[-1]] == [0, len(row) - 1]
-        assert limit == 1 or np.ptp(np.diff(places)) <= 1 <= np.diff(places).min()  # strides differ by one at most
+        # Strides differ by one at most.
+        assert limit == 1 or np.ptp(np.diff(places)) <= 1 <= np.diff(places).min()
         np.testing.assert_allclose([amounts[one] for one in picked], factor * values[places])

@@ -1,4 +1,6 @@
-"""Tables of a run with material tests: files and patterns, a name for each test, sizes, and what the report says."""
+"""Tables of a run with material tests: files and patterns,
+a name for each test, sizes, and what the report says.
+"""
 
 import numpy as np
 import pytest
@@ -18,13 +20,21 @@ BAR = {"length": 0.033, "width": 0.006, "thickness": 0.003}
 def written(path, c10=30e3, strain=None, after=""):
     path.parent.mkdir(parents=True, exist_ok=True)
     strain = np.linspace(0.02, 1.0, 50) if strain is None else strain
-    rows = [f"{e:.6f},{1e-3 * s:.6f}" for e, s in zip(strain, stress("tension", strain, {"c10": c10}), strict=True)]
+    rows = [
+        f"{e:.6f},{1e-3 * s:.6f}"
+        for e, s in zip(strain, stress("tension", strain, {"c10": c10}), strict=True)
+    ]
     path.write_text("\n".join(["strain,stress [kPa]", *rows]) + after, encoding="utf-8")
 
 
 def settings(folder, **files):
-    tests = {name: {"kind": "tension", "file": str(file), "specimen": BAR} for name, file in files.items()}
-    return MaterialTestData.model_validate({"kind": "material_tests", "folder": str(folder), "tests": tests})
+    tests = {
+        name: {"kind": "tension", "file": str(file), "specimen": BAR}
+        for name, file in files.items()
+    }
+    return MaterialTestData.model_validate(
+        {"kind": "material_tests", "folder": str(folder), "tests": tests}
+    )
 
 
 def names(folder, **files):
@@ -76,7 +86,9 @@ def test_a_file_that_exists_is_no_pattern(tmp_path):
     for file in ("lost.csv", "**", "**lost.csv", "lost*.csv", str(lost)):
         said = "there is no file .*: set data.folder and data.tests.test.file"
         refuses(DataFileError, said, table_files, settings(tmp_path / "data", test=file))
-    refuses(DataFileError, "is a folder, not a file", table_files, settings(tmp_path / "data", test="."))
+    refuses(
+        DataFileError, "is a folder, not a file", table_files, settings(tmp_path / "data", test=".")
+    )
 
 
 def test_the_report_names_what_was_left_out(tmp_path):
@@ -93,8 +105,8 @@ def test_the_report_names_what_was_left_out(tmp_path):
     said = " ".join(ran.out.split())
     left = (
         "x/test: 1 of 53 samples left out: line 53, without a number in each column.",
-        "x/test: 2 of 52 samples left out, after the specimen broke: line 52, strain 1.01, stress 0.12 kPa, and 1 "
-        "other.",
+        "x/test: 2 of 52 samples left out, after the specimen broke: line 52, strain 1.01, "
+        "stress 0.12 kPa, and 1 other.",
     )
     report = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     for sentence in left:

@@ -5,11 +5,27 @@ import math
 import numpy as np
 import pytest
 
-from warp_resphys import Body, Inputs, Mesh, Simulator, SolverSettings, box_hexahedra, box_tetrahedra, quadratic
+from warp_resphys import (
+    Body,
+    Inputs,
+    Mesh,
+    Simulator,
+    SolverSettings,
+    box_hexahedra,
+    box_tetrahedra,
+    quadratic,
+)
 from warp_resphys.energies.catalogue import MATERIALS
 from warp_resphys.fem.integration_points import discretise, physical_gradients
 from warp_resphys.io.errors import InputError
-from warp_resphys.mesh.elements import BY_NODES, ELEMENTS, FACES, conical_simplex, degree_two_tetrahedron, gauss_box
+from warp_resphys.mesh.elements import (
+    BY_NODES,
+    ELEMENTS,
+    FACES,
+    conical_simplex,
+    degree_two_tetrahedron,
+    gauss_box,
+)
 from warp_resphys.mesh.volume_mesh import surface_vertices
 
 SIZE, DIVISIONS = (0.03, 0.02, 0.02), (3, 2, 2)
@@ -18,7 +34,7 @@ SHAPES |= {f"face of {nodes}": face.shape for nodes, face in FACES.items()}
 
 
 def distorted(mesh, amount=0.12):
-    """Returns a mesh with every vertex, also on the boundary, moved by up to a fraction of an element."""
+    """A mesh with every vertex, also on the boundary, moved by up to a fraction of an element."""
     cell = SIZE[0] / DIVISIONS[0]
     rng = np.random.default_rng(0)
     return Mesh(mesh.vertices + amount * cell * rng.uniform(-1, 1, mesh.vertices.shape), mesh.cells)
@@ -67,11 +83,15 @@ def test_rules_of_faces_integrate_linear_fields(nodes):
     values, area = face.shape(points)[0][:, : face.corners], 0.5 if face.corners == 3 else 4.0
     if nodes == face.corners:
         np.testing.assert_allclose(weights @ values, area / face.corners, rtol=1e-13)
-    np.testing.assert_allclose(weights @ points, area * face.shape.nodes[: face.corners].mean(axis=0), atol=1e-14)
+    np.testing.assert_allclose(
+        weights @ points, area * face.shape.nodes[: face.corners].mean(axis=0), atol=1e-14
+    )
 
 
 @pytest.mark.parametrize(
-    ("rule", "degree"), [(degree_two_tetrahedron(), 2), (conical_simplex(4), 5)], ids=["4 points", "64 points"]
+    ("rule", "degree"),
+    [(degree_two_tetrahedron(), 2), (conical_simplex(4), 5)],
+    ids=["4 points", "64 points"],
 )
 def test_rules_of_the_tetrahedron_are_exact(rule, degree):
     points, weights = rule
@@ -91,7 +111,10 @@ def test_volumes_and_masses_sum_to_the_total(name, integration):
         total = d.element_volumes.sum()
     elif "hexahedra" in name:
         points, weights = gauss_box(4)  # which are exact for plane edges
-        total = (physical_gradients(mesh.vertices, mesh.cells, mesh.element.shape(points)[1])[1] @ weights).sum()
+        total = (
+            physical_gradients(mesh.vertices, mesh.cells, mesh.element.shape(points)[1])[1]
+            @ weights
+        ).sum()
     elif "tetrahedra" in name:
         corners = mesh.vertices[mesh.cells[:, :4]]
         total = np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 6
@@ -131,13 +154,16 @@ def test_vertex_patch_averages_the_gradients_of_its_cells_by_volume():
 
 
 PATCH_MESHES = [name for name in MESHES if "curved" not in name]
-# Curved edges reproduce linear maps at every point, but the quadratures do not integrate the products of their rational
-# gradients, so that the patch test holds for straight-sided cells.
+# Curved edges reproduce linear maps at every point, but the quadratures do not integrate the
+# products of their rational gradients, so that the patch test holds for straight-sided cells.
 
 
 @pytest.mark.parametrize("element", ELEMENTS.values(), ids=ELEMENTS)
 def test_faces_look_outwards_and_lie_on_the_cell(element):
-    """Their corners run counter-clockwise seen from outside; the other nodes are in the middle of edges and faces."""
+    """Their corners run counter-clockwise seen from outside.
+
+    The other nodes are in the middle of edges and faces.
+    """
     nodes = element.shape.nodes
     for face in element.faces:
         corners = nodes[face[: element.face.corners]]
@@ -148,7 +174,9 @@ def test_faces_look_outwards_and_lie_on_the_cell(element):
     assert BY_NODES[element.nodes] is element
 
 
-@pytest.mark.parametrize(("model", "integration"), [("corotated", "centre"), ("stable_neo_hookean", "full")])
+@pytest.mark.parametrize(
+    ("model", "integration"), [("corotated", "centre"), ("stable_neo_hookean", "full")]
+)
 @pytest.mark.parametrize("name", PATCH_MESHES)
 def test_patch(name, model, integration):
     """A linear displacement of the boundary extends linearly to the interior."""

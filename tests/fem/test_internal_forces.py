@@ -1,4 +1,6 @@
-"""Internal forces: what holds a body carries true loads alone, and nothing drives a body that is free."""
+"""Internal forces: what holds a body carries true loads alone,
+and nothing drives a body that is free.
+"""
 
 import numpy as np
 import pytest
@@ -22,7 +24,8 @@ from warp_resphys.fem.internal_forces import InternalForces
 from warp_resphys.stepping.state import Reaction
 
 BEAM = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 2))
-pytestmark = pytest.mark.filterwarnings("ignore::warp_resphys.io.errors.ResphysWarning")  # of few cells
+# Of few cells.
+pytestmark = pytest.mark.filterwarnings("ignore::warp_resphys.io.errors.ResphysWarning")
 SILICONE = Corotated(264e3, 0.45, density=1070.0, mass_damping=0.5, stiffness_damping=2e-3)
 TIGHT = SolverSettings(name="newton", relative_tolerance=1e-13)
 ABOUT = (0.01, -0.02, 0.03)
@@ -49,7 +52,9 @@ def weight(simulator):
 
 
 def rate(simulator, before, after):
-    """Wrench of the rate of change of momentum of implicit Euler, with damping, about a point at the end."""
+    """Wrench of the rate of change of momentum of implicit Euler,
+    with damping, about a point at the end.
+    """
     constants, h = simulator.prepare(), simulator.time_step
     changes = (after.v - before.v) / h + constants.mass_damping[..., None] * after.v
     return wrench(constants.mass[..., None] * changes, after.q)
@@ -59,12 +64,15 @@ def held(reaction):
     return torch.cat([reaction.force, reaction.moment(ABOUT)], 1)
 
 
-@pytest.mark.parametrize("fixed", [select_vertices(BEAM, x=0.0), ENDS], ids=["one clamp", "two clamps"])
+@pytest.mark.parametrize(
+    "fixed", [select_vertices(BEAM, x=0.0), ENDS], ids=["one clamp", "two clamps"]
+)
 def test_clamps_hold_the_weight_alone(fixed, device):
     simulator = simulated(Body(BEAM, fixed), device=device)
     force = forces(simulator)
     at_rest = simulator.static_equilibrium(Inputs(internal_force=force))
-    assert float((at_rest.q - simulator.static_equilibrium().q).abs().max()) > 5e-5  # the forces bend the beam
+    # The forces bend the beam.
+    assert float((at_rest.q - simulator.static_equilibrium().q).abs().max()) > 5e-5
     loads = wrench(weight(simulator).expand_as(at_rest.q), at_rest.q)
     torch.testing.assert_close(held(at_rest.reaction), -loads, rtol=0.0, atol=1e-10)
 
@@ -76,7 +84,9 @@ def test_clamps_give_the_rate_of_change_of_momentum_in_motion():
         inputs = Inputs(internal_force=forces(simulator), external_force=push)
         before, state = state, simulator.step(state, inputs)
         loads = wrench(weight(simulator) + push, state.q)
-        torch.testing.assert_close(held(state.reaction), rate(simulator, before, state) - loads, rtol=0.0, atol=1e-8)
+        torch.testing.assert_close(
+            held(state.reaction), rate(simulator, before, state) - loads, rtol=0.0, atol=1e-8
+        )
 
 
 def test_internal_forces_move_a_clamped_body_like_external_ones():
@@ -100,7 +110,9 @@ def test_two_clamps_share_a_force_by_the_law_of_the_lever():
     force = torch.zeros_like(q)
     at = int(select_vertices(bar, x=0.2, y=0.02, z=0.02)[0])
     force[0, at, 1] = 1.0
-    taken = internal.taken_up(Reaction(torch.as_tensor(ends), 0.0 * q[:, ends], q[:, ends]), force, q)
+    taken = internal.taken_up(
+        Reaction(torch.as_tensor(ends), 0.0 * q[:, ends], q[:, ends]), force, q
+    )
     left = bar.vertices[ends, 0] == 0.0
     assert float(taken.forces[0, left, 1].sum()) == pytest.approx(2.0 / 3.0, rel=1e-3)
     assert float(taken.forces[0, ~left, 1].sum()) == pytest.approx(1.0 / 3.0, rel=1e-3)
@@ -114,10 +126,12 @@ def test_a_free_body_keeps_its_momentum():
     state = simulator.state(rest.q, torch.linalg.cross(spin, rest.q))
     push = 0.05 * forces(simulator).flip(1)
     for _ in range(3):
-        before, state = state, simulator.step(state, Inputs(internal_force=forces(simulator), external_force=push))
+        before = state
+        state = simulator.step(state, Inputs(internal_force=forces(simulator), external_force=push))
         loads = wrench(weight(simulator) + push, state.q)
         torch.testing.assert_close(rate(simulator, before, state), loads, rtol=0.0, atol=1e-8)
-    assert float((torch.cdist(state.q, state.q) - torch.cdist(rest.q, rest.q)).abs().max()) > 1e-4  # it deforms
+    # It deforms.
+    assert float((torch.cdist(state.q, state.q) - torch.cdist(rest.q, rest.q)).abs().max()) > 1e-4
 
 
 def test_a_free_body_whose_vertices_have_no_mass_is_balanced():
@@ -126,7 +140,9 @@ def test_a_free_body_whose_vertices_have_no_mass_is_balanced():
     internal, q = InternalForces(Body(BEAM), rest), rest[None]
     force = 1.0 + noise(1, len(rest), 3)
     balanced = internal.balanced(force, q, torch.zeros(1, len(rest), dtype=torch.float64))
-    torch.testing.assert_close(wrench(balanced, q), torch.zeros(1, 6).double(), rtol=0.0, atol=1e-12)
+    torch.testing.assert_close(
+        wrench(balanced, q), torch.zeros(1, 6).double(), rtol=0.0, atol=1e-12
+    )
     assert internal.follow_pose(force)
     assert not internal.follow_pose(0.0 * force)
 
@@ -139,17 +155,23 @@ def test_a_body_on_pins_swings_under_true_loads_alone(count):
     before = simulator.rest_state(2)
     state = simulator.step(before, Inputs(internal_force=forces(simulator)))
     loads = wrench(weight(simulator).expand_as(state.q), state.q)
-    torch.testing.assert_close(held(state.reaction), rate(simulator, before, state) - loads, rtol=0.0, atol=1e-8)
+    torch.testing.assert_close(
+        held(state.reaction), rate(simulator, before, state) - loads, rtol=0.0, atol=1e-8
+    )
 
 
 def test_half_a_body_is_held_by_its_other_half():
     """The clamp of a half carries half of the weight, as without internal forces."""
-    simulator = simulated(Body(BEAM, select_vertices(BEAM, x=0.0), symmetry=[SymmetryPlane((0.0, 1.0, 0.0))]))
+    simulator = simulated(
+        Body(BEAM, select_vertices(BEAM, x=0.0), symmetry=[SymmetryPlane((0.0, 1.0, 0.0))])
+    )
     clamp = simulator.fixed
     state = simulator.static_equilibrium(Inputs(internal_force=forces(simulator)))
     along = [0, 2, 4]  # forces in the plane and the moment about its normal
     loads = wrench(weight(simulator).expand_as(state.q), state.q)
-    torch.testing.assert_close(held(state.reaction)[:, along], -loads[:, along], rtol=0.0, atol=1e-10)
+    torch.testing.assert_close(
+        held(state.reaction)[:, along], -loads[:, along], rtol=0.0, atol=1e-10
+    )
     assert len(clamp) < len(state.reaction.vertices)
 
 
@@ -161,7 +183,9 @@ def test_each_body_of_a_scene_takes_up_its_own():
     mass = simulator.prepare().mass[..., None]
     for name in scene.bodies:
         part = scene.vertex_slice(name)
-        rates = (mass * ((state.v - before.v) / simulator.time_step + 0.5 * state.v))[:, part].sum(1)
+        rates = (mass * ((state.v - before.v) / simulator.time_step + 0.5 * state.v))[:, part].sum(
+            1
+        )
         expected = rates - weight(simulator)[:, part].sum(1)
         holds = 0.0 if name == "c" else simulator.reaction(state, name).force
         torch.testing.assert_close(expected, 0.0 * expected + holds, rtol=0.0, atol=1e-8)

@@ -1,4 +1,6 @@
-"""Several bodies in one simulator, and bodies in another place, which move as the first ones do there."""
+"""Several bodies in one simulator, and bodies in another place,
+which move as the first ones do there.
+"""
 
 import numpy as np
 import pytest
@@ -7,7 +9,19 @@ from scipy.spatial.transform import Rotation
 
 from support.chambered import hollow_box
 from support.clamped import clamped
-from warp_resphys import Body, Fibres, Inputs, Mesh, Muscles, Pressure, Rigid, Scene, Simulator, SymmetryPlane, Tendons
+from warp_resphys import (
+    Body,
+    Fibres,
+    Inputs,
+    Mesh,
+    Muscles,
+    Pressure,
+    Rigid,
+    Scene,
+    Simulator,
+    SymmetryPlane,
+    Tendons,
+)
 from warp_resphys.energies import Muscle
 from warp_resphys.energies.materials import Corotated, StableNeoHookean
 from warp_resphys.io.errors import InputError, MeshError
@@ -27,21 +41,34 @@ def finger():
 
 def ball():
     """A rigid body of other cells, free to fall."""
-    return Body.rigid_body(box_tetrahedra((0.02, 0.02, 0.02), (1, 1, 1), order=2), Rigid(density=900.0))
+    return Body.rigid_body(
+        box_tetrahedra((0.02, 0.02, 0.02), (1, 1, 1), order=2), Rigid(density=900.0)
+    )
 
 
 def test_bodies_of_a_scene_move_as_each_alone():
     scene = Scene({"finger": finger(), "ball": ball()})
     pulled = Inputs(tendon_tension=np.array([[0.5]]))
     together = Simulator(scene, SOFT)
-    assert {"finger_youngs_modulus", "finger_tendon_friction", "ball_body_density"} <= together.parameters.keys()
+    assert {
+        "finger_youngs_modulus",
+        "finger_tendon_friction",
+        "ball_body_density",
+    } <= together.parameters.keys()
     motion = together.rollout(together.rest_state(), 6, scene.inputs({"finger": pulled}))
-    for name, body, material, inputs in (("finger", finger(), SOFT, pulled), ("ball", ball(), {}, Inputs())):
+    for name, body, material, inputs in (
+        ("finger", finger(), SOFT, pulled),
+        ("ball", ball(), {}, Inputs()),
+    ):
         alone = Simulator(body, material)
         own = alone.rollout(alone.rest_state(), 6, inputs)
-        torch.testing.assert_close(motion.q[:, :, scene.vertex_slice(name)], own.q, rtol=0.0, atol=1e-9)
+        torch.testing.assert_close(
+            motion.q[:, :, scene.vertex_slice(name)], own.q, rtol=0.0, atol=1e-9
+        )
         for key, value in own.final.memory.items():
-            torch.testing.assert_close(motion.final.memory[f"{name}_{key}"], value, rtol=0.0, atol=1e-9)
+            torch.testing.assert_close(
+                motion.final.memory[f"{name}_{key}"], value, rtol=0.0, atol=1e-9
+            )
 
 
 def test_forces_clamps_materials_and_regions_go_to_the_body_that_is_named():
@@ -80,10 +107,14 @@ def test_a_body_may_be_driven_as_a_whole_but_not_all_of_them():
     places = simulator.rest_positions[simulator.fixed].clone()
     places[: len(mesh.vertices), 1] += 0.2
     path = simulator.rollout(simulator.rest_state(), 3, Inputs(fixed_positions=places[None]))
-    assert torch.equal(path.q[-1][:, scene.vertex_slice("tool")], places[None, : len(mesh.vertices)])
+    assert torch.equal(
+        path.q[-1][:, scene.vertex_slice("tool")], places[None, : len(mesh.vertices)]
+    )
     alone = Simulator(finger(), SOFT)
     own = alone.rollout(alone.rest_state(), 3)
-    torch.testing.assert_close(path.q[:, :, scene.vertex_slice("finger")], own.q, rtol=0.0, atol=1e-9)
+    torch.testing.assert_close(
+        path.q[:, :, scene.vertex_slice("finger")], own.q, rtol=0.0, atol=1e-9
+    )
     with pytest.raises(InputError, match="every vertex is fixed"):
         Simulator(Scene({"tool": driven, "other": driven}), SOFT)
 
@@ -100,9 +131,19 @@ BODIES = {
         {"tendon_tension": 0.4},
         {"tendon_offset_1": 2e-3},
     ),
-    "muscle": (clamped(BOX, energies=[Muscles([Muscle([2, 3], (1.0, 0.5, 0.0))])]), {"muscle_stress": 2e4}, {}),
+    "muscle": (
+        clamped(BOX, energies=[Muscles([Muscle([2, 3], (1.0, 0.5, 0.0))])]),
+        {"muscle_stress": 2e4},
+        {},
+    ),
     "chamber": (
-        clamped(HOLLOW, energies=[Pressure(CHAMBER), Fibres(CHAMBER, [20.0], axis=(1.0, 0.2, 0.1), stiffness=1e3)]),
+        clamped(
+            HOLLOW,
+            energies=[
+                Pressure(CHAMBER),
+                Fibres(CHAMBER, [20.0], axis=(1.0, 0.2, 0.1), stiffness=1e3),
+            ],
+        ),
         {"pressure": 3e4},
         {},
     ),
@@ -116,7 +157,11 @@ def test_the_motion_moves_with_the_body(name):
     material, ends = Corotated(2e5, 0.4), []
     for own, pull in ((body, gravity), (body.moved(ROTATION, SHIFT), ROTATION @ gravity)):
         simulator = Simulator(own, material, 0.01, tuple(pull), relative_tolerance=1e-11)
-        ends.append(simulator.rollout(simulator.rest_state(), 5, Inputs(**given), parameters).q[-1, 0].numpy())
+        ends.append(
+            simulator.rollout(simulator.rest_state(), 5, Inputs(**given), parameters)
+            .q[-1, 0]
+            .numpy()
+        )
     without = Simulator(body, material, 0.01, tuple(gravity))
     free = without.rollout(without.rest_state(), 5).q[-1, 0].numpy()
     assert np.abs(ends[0] - free).max() > 1e-4  # The actuator does something.

@@ -1,6 +1,7 @@
 """Tasks in several processes: results, lost workers, errors and interruption.
 
-Workers import this module. Tasks that need torch or a simulator import it, as it takes most of the start of a worker.
+Workers import this module. Tasks that need torch or a simulator import it, as it takes most of the
+start of a worker.
 """
 
 import os
@@ -45,12 +46,17 @@ def workers(request, monkeypatch):
         yield Workers(2)
         return
     distributed = pytest.importorskip("distributed")
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # where workers find these functions
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+    # Where workers find these functions.
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None
+    ) as cluster:
         yield Workers(2, cluster.scheduler_address)
 
 
-def test_results_come_in_order_from_other_processes_on_one_thread_in_a_shared_folder(workers, tmp_path):
+def test_results_come_in_order_from_other_processes_on_one_thread_in_a_shared_folder(
+    workers, tmp_path
+):
     results, numbers = done(work, [(tmp_path, number) for number in range(1, 6)], workers, tmp_path)
     assert [result for _, _, result in results] == [10, 20, 30, 40, 50]
     assert sorted(numbers) == [0, 1, 2, 3, 4]
@@ -97,7 +103,9 @@ def dies_once(task):
 
 @pytest.mark.slow
 def test_the_task_of_a_killed_worker_is_repeated(workers, tmp_path):
-    results, numbers = done(dies_once, [(tmp_path, number) for number in range(4)], workers, tmp_path)
+    results, numbers = done(
+        dies_once, [(tmp_path, number) for number in range(4)], workers, tmp_path
+    )
     assert results == [0, 1, 4, 9]
     assert (tmp_path / "died").exists()
     assert sorted(numbers) == [0, 1, 2, 3]
@@ -110,7 +118,8 @@ def test_nothing_to_do(tmp_path):
 def test_dask_that_is_not_installed(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(
-        InputError, match=r"parallel\.address=tcp://head:8786 needs a package.*'warp-resphys\[cluster\]'"
+        InputError,
+        match=r"parallel\.address=tcp://head:8786 needs a package.*'warp-resphys\[cluster\]'",
     ):
         done(work, [1], Workers(2, "tcp://head:8786"), tmp_path)
 
@@ -181,6 +190,9 @@ def test_workers_end_with_their_parent(tmp_path, sent):
 
 @pytest.mark.slow
 def test_workers_repeat_no_warning_of_warp():
-    code = "import os; from warp_resphys.io.fan_out import _begin_work; _begin_work(); os.write(2, b'own message')"
+    code = (
+        "import os; from warp_resphys.io.fan_out import _begin_work; "
+        "_begin_work(); os.write(2, b'own message')"
+    )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (ended.stdout, ended.stderr) == ("", "own message")

@@ -44,7 +44,9 @@ class TestAtomicFiles:
 
     def test_an_unwritable_path_is_named(self, tmp_path):
         (tmp_path / "file").write_text("")
-        with pytest.raises(DataFileError, match=r"cannot write .*file/sub/a\.json \(Not a directory\)"):
+        with pytest.raises(
+            DataFileError, match=r"cannot write .*file/sub/a\.json \(Not a directory\)"
+        ):
             safe_files.write_json(tmp_path / "file" / "sub" / "a.json", {})
         (tmp_path / "folder.h5").mkdir()
         with (
@@ -60,7 +62,10 @@ class TestAtomicFiles:
     def test_a_full_disk_is_named_and_the_old_file_stays(self, tmp_path):
         path = tmp_path / "a.json"
         safe_files.write_json(path, 1)
-        with pytest.raises(DataFileError, match=r"disk is full while writing .*a\.json"), atomic.atomic_path(path):
+        with (
+            pytest.raises(DataFileError, match=r"disk is full while writing .*a\.json"),
+            atomic.atomic_path(path),
+        ):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         assert safe_files.read_json(path) == 1
 
@@ -74,7 +79,9 @@ class TestAtomicFiles:
                 safe_files.create(file, "x", np.ones(8000), "m")
 
         work = {
-            "a.safetensors": lambda: safe_files.write_checkpoint(path, "k", {"x": torch.ones(8000).double()}, {}),
+            "a.safetensors": lambda: safe_files.write_checkpoint(
+                path, "k", {"x": torch.ones(8000).double()}, {}
+            ),
             "a.h5": write,
             "a.json": lambda: safe_files.write_json(path, [0] * 40_000),
         }
@@ -89,17 +96,30 @@ class TestAtomicFiles:
 class TestJson:
     def test_numpy_values_paths_and_infinite_numbers(self, tmp_path):
         path = tmp_path / "a.json"
-        data = {"x": np.float64(1.5), "n": np.array([[1, 2]]), "p": Path("b"), "bad": [np.nan, -np.inf], 3: True}
+        data = {
+            "x": np.float64(1.5),
+            "n": np.array([[1, 2]]),
+            "p": Path("b"),
+            "bad": [np.nan, -np.inf],
+            3: True,
+        }
         safe_files.write_json(path, data)
         parsed = json.loads(path.read_text(), parse_constant=pytest.fail)
         assert parsed == {"x": 1.5, "n": [[1, 2]], "p": "b", "bad": [None, None], "3": True}
 
     def test_objects_are_refused(self, tmp_path):
-        refuses(TypeError, "object cannot be written", safe_files.write_json, tmp_path / "a.json", {"a": object()})
+        refuses(
+            TypeError,
+            "object cannot be written",
+            safe_files.write_json,
+            tmp_path / "a.json",
+            {"a": object()},
+        )
         assert os.listdir(tmp_path) == []
 
     @pytest.mark.parametrize(
-        ("content", "message"), [(b'{"a": 1', "not a JSON file"), (b"\xff\xfe", "not a JSON"), (None, "not exist")]
+        ("content", "message"),
+        [(b'{"a": 1', "not a JSON file"), (b"\xff\xfe", "not a JSON"), (None, "not exist")],
     )
     def test_unreadable(self, tmp_path, content, message):
         path = tmp_path / "a.json"
@@ -116,14 +136,20 @@ class TestHdf5:
             assert dataset.attrs["units"] == "m"
             assert file.attrs["time_step"] == 0.01
             assert safe_files.read_array(file, "weights/mass", shape=()) == 0.05
-            assert np.array_equal(safe_files.read_array(file, "positions", index=(slice(3, 5), 2)), POSITIONS[3:5, 2])
+            assert np.array_equal(
+                safe_files.read_array(file, "positions", index=(slice(3, 5), 2)), POSITIONS[3:5, 2]
+            )
         assert np.array_equal(read_positions(trajectory), POSITIONS)
 
-    def test_cut_anywhere_it_is_refused_and_a_flipped_bit_never_gives_other_numbers(self, trajectory):
+    def test_cut_anywhere_it_is_refused_and_a_flipped_bit_never_gives_other_numbers(
+        self, trajectory
+    ):
         content = trajectory.read_bytes()
         for length in [*range(0, 2048, 97), len(content) // 2, len(content) - 1]:
             trajectory.write_bytes(content[:length])
-            with pytest.raises(DataFileError, match=r"trajectory\.h5 (is truncated|is not an HDF5 file|is damaged)"):
+            with pytest.raises(
+                DataFileError, match=r"trajectory\.h5 (is truncated|is not an HDF5 file|is damaged)"
+            ):
                 read_positions(trajectory)
         content = trajectory.read_bytes()
         refused = 0
@@ -152,7 +178,10 @@ class TestHdf5:
         [
             ({"format": "other"}, "was not written by warp_resphys"),
             ({"format": "warp_resphys", "version": 2}, "format version 2"),
-            ({"format": "warp_resphys", "version": 1, "kind": "forces"}, "contains 'forces' where 'trajectories'"),
+            (
+                {"format": "warp_resphys", "version": 1, "kind": "forces"},
+                "contains 'forces' where 'trajectories'",
+            ),
             ({"format": "warp_resphys", "version": 1, "kind": "trajectories"}, "is unfinished"),
         ],
     )
@@ -160,7 +189,10 @@ class TestHdf5:
         path = tmp_path / "a.h5"
         with h5py.File(path, "w") as file:
             file.attrs.update(attributes)
-        with pytest.raises(DataFileError, match=message), safe_files.read_hdf5(path, "trajectories"):
+        with (
+            pytest.raises(DataFileError, match=message),
+            safe_files.read_hdf5(path, "trajectories"),
+        ):
             pass
 
     def test_no_hdf5_at_all_and_missing_and_misshapen_datasets(self, tmp_path, trajectory):
@@ -172,7 +204,10 @@ class TestHdf5:
             ("none.h5", "does not exist"),
             (".", "Is a directory"),
         ]:
-            with pytest.raises(DataFileError, match=message), safe_files.read_hdf5(tmp_path / name, "trajectories"):
+            with (
+                pytest.raises(DataFileError, match=message),
+                safe_files.read_hdf5(tmp_path / name, "trajectories"),
+            ):
                 pass
         with safe_files.read_hdf5(trajectory, "trajectories") as file:
             for name in ("velocities", "weights"):
@@ -197,7 +232,10 @@ class TestHdf5:
                 layout = h5py.VirtualLayout((130, 4, 3), "f8")
                 layout[...] = h5py.VirtualSource(str(trajectory), "positions", (130, 4, 3))
                 group.create_virtual_dataset("x", layout)
-        with pytest.raises(DataFileError, match="'/inner/x'"), safe_files.read_hdf5(path, "trajectories"):
+        with (
+            pytest.raises(DataFileError, match="'/inner/x'"),
+            safe_files.read_hdf5(path, "trajectories"),
+        ):
             pass
 
     def test_errors_of_other_files_are_not_blamed_on_this_one(self, trajectory, tmp_path):
@@ -208,17 +246,22 @@ class TestHdf5:
 class TestCheckpoints:
     @property
     def tensors(self) -> dict[str, torch.Tensor]:
-        return {"weight": torch.arange(6.0).reshape(2, 3).T, "step": torch.tensor(3)}  # not contiguous
+        # Not contiguous.
+        return {"weight": torch.arange(6.0).reshape(2, 3).T, "step": torch.tensor(3)}
 
     def test_round_trip(self, tmp_path):
         path = tmp_path / "a.safetensors"
         shared = {**self.tensors, "alias": self.tensors["weight"]}
-        safe_files.write_checkpoint(path, "network", shared, {"epoch": 3, "mean": np.float64(0.5), "fingerprint": "f"})
+        safe_files.write_checkpoint(
+            path, "network", shared, {"epoch": 3, "mean": np.float64(0.5), "fingerprint": "f"}
+        )
         tensors, metadata = safe_files.read_checkpoint(path, "network")
         assert all(torch.equal(tensors[name], shared[name]) for name in shared)
         assert metadata == {"epoch": 3, "mean": 0.5, "fingerprint": "f"}
         tensors["weight"] += 1  # own memory, not the file's
-        assert torch.equal(safe_files.read_checkpoint(path, "network")[0]["weight"], self.tensors["weight"])
+        assert torch.equal(
+            safe_files.read_checkpoint(path, "network")[0]["weight"], self.tensors["weight"]
+        )
 
     def test_damage_anywhere_is_one_sentence_or_does_no_harm(self, tmp_path):
         path = tmp_path / "a.safetensors"
@@ -243,16 +286,30 @@ class TestCheckpoints:
             path.write_bytes(content[:length])
             with pytest.raises(DataFileError, match=r"not a complete safetensors file|is damaged"):
                 safe_files.read_checkpoint(path, "network")
-        refuses(DataFileError, "does not exist", safe_files.read_checkpoint, tmp_path / "none", "network")
+        refuses(
+            DataFileError,
+            "does not exist",
+            safe_files.read_checkpoint,
+            tmp_path / "none",
+            "network",
+        )
         from safetensors.torch import save_file
 
         save_file({"x": torch.zeros(2)}, path)
-        refuses(DataFileError, "was not written by warp_resphys", safe_files.read_checkpoint, path, "network")
+        refuses(
+            DataFileError,
+            "was not written by warp_resphys",
+            safe_files.read_checkpoint,
+            path,
+            "network",
+        )
 
     def test_those_of_other_settings_or_cut_short_are_not_used(self, tmp_path, caplog):
         path = tmp_path / "a.safetensors"
         safe_files.write_checkpoint(path, "network", self.tensors, {"fingerprint": "f"})
-        assert torch.equal(safe_files.resume_checkpoint(path, "network", "f")[0]["weight"], self.tensors["weight"])
+        assert torch.equal(
+            safe_files.resume_checkpoint(path, "network", "f")[0]["weight"], self.tensors["weight"]
+        )
         assert safe_files.resume_checkpoint(path, "network", "g") is None
         assert safe_files.resume_checkpoint(tmp_path / "none", "network", "f") is None
         assert "belongs to other settings" in caplog.text

@@ -1,4 +1,6 @@
-"""Numbers of tables: decimal commas and thousands, by the other numbers of the column or the table, or refused."""
+"""Numbers of tables: decimal commas and thousands, by the other numbers of the column
+or the table, or refused.
+"""
 
 import pytest
 
@@ -46,17 +48,27 @@ def test_quoted_numbers_between_commas(tmp_path):
 
 @pytest.mark.parametrize(
     ("cells", "other"),
-    [(("999", "1,012"), "3"), (("999", "1.012"), "3"), (("1,012", "2,500"), "3"), (("1,012", "5"), "0.5 0,5")],
+    [
+        (("999", "1,012"), "3"),
+        (("999", "1.012"), "3"),
+        (("1,012", "2,500"), "3"),
+        (("1,012", "5"), "0.5 0,5"),
+    ],
 )
 def test_a_number_that_may_be_two_is_refused(tmp_path, cells, other):
     path = tmp_path / "a.csv"
-    said = r"a.csv, line \d, column 2: '1[,.]012' is 1012 or 1.012, and no other number tells which: write 1012"
+    said = (
+        r"a.csv, line \d, column 2: '1[,.]012' is 1012 or 1.012, "
+        "and no other number tells which: write 1012"
+    )
     refuses(DataFileError, said, column, path, *cells, other=other.split())
 
 
 def test_names_and_a_key_with_its_value_are_no_evidence(tmp_path):
     path = tmp_path / "a.csv"
-    path.write_text("Version;1.25\nSerial;1,234\nstrain;force [N]\n0,1;1.012\n0,2;999\n", encoding="utf-8")
+    path.write_text(
+        "Version;1.25\nSerial;1,234\nstrain;force [N]\n0,1;1.012\n0,2;999\n", encoding="utf-8"
+    )
     rows = read_rows(path)
     assert rows[1] == ["Serial", "1,234"]
     assert rows[3] == ["0.1", "1012"]

@@ -35,7 +35,9 @@ for name in {names}:
 from warp_resphys.io.machine import available_memory_gib, peak_memory_gib
 print(available_memory_gib() > 0.0, peak_memory_gib() >= 0.0)
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
     assert done.stdout == "True True\n", done.stderr
 
 
@@ -80,18 +82,29 @@ def test_workers_start_where_signals_cannot_be_blocked(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen on this system")
+@pytest.mark.skipif(
+    not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen on this system"
+)
 def test_cores_are_those_that_the_process_may_use():
     core = min(os.sched_getaffinity(0))
-    program = "from warp_resphys.io import machine; print(machine.available_cores(), machine.hardware()['cores used'])"
+    program = (
+        "from warp_resphys.io import machine; print(machine.available_cores(), "
+        "machine.hardware()['cores used'])"
+    )
     command = [sys.executable, "-c", f"import os; os.sched_setaffinity(0, [{core}]); {program}"]
     out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert out == f"1 1 of {os.cpu_count()}\n"
 
 
 def test_the_commit_is_that_of_the_repository():
-    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=REPOSITORY, capture_output=True, text=True, check=False)
-    assert commit() is None if head.returncode else head.stdout.startswith(str(commit()).partition(" ")[0])
+    head = subprocess.run(
+        ["git", "rev-parse", "HEAD"], cwd=REPOSITORY, capture_output=True, text=True, check=False
+    )
+    assert (
+        commit() is None
+        if head.returncode
+        else head.stdout.startswith(str(commit()).partition(" ")[0])
+    )
 
 
 @pytest.mark.parametrize("error", [None, ImportError])
@@ -134,7 +147,12 @@ def test_a_cache_that_cannot_be_made_is_a_temporary_one(name, tmp_path):
     own = {k: v for k, v in os.environ.items() if k not in ("XDG_CACHE_HOME", "WARP_CACHE_PATH")}
     environment = own | {name: str(tmp_path / "file" / "below")}
     run = subprocess.run(
-        [sys.executable, program], env=environment, cwd=tmp_path, capture_output=True, text=True, check=False
+        [sys.executable, program],
+        env=environment,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert run.returncode == 0, run.stderr
     results = [line for line in run.stdout.splitlines() if line.startswith("[2.0, 2.0, 2.0] ")]

@@ -26,7 +26,10 @@ def growing(names, kept, report):
 
 
 def parts_of(kept):
-    return [TrialPart(f"part_{first}", names, FRAMES, partial(growing, names, kept)) for first, names in cut(NAMES, 2)]
+    return [
+        TrialPart(f"part_{first}", names, FRAMES, partial(growing, names, kept))
+        for first, names in cut(NAMES, 2)
+    ]
 
 
 @pytest.mark.parametrize("settings", ["same", "other"])
@@ -42,7 +45,9 @@ def test_interrupted_work_keeps_its_finished_parts(tmp_path, settings):
     parts = Parts("powers", folder=folder, fingerprint=settings)
     parts.run(work)
     assert len(kept["computed"]) == (5 if settings == "same" else 10)
-    np.testing.assert_array_equal(parts.joined(work, "power"), [[n**k for k in range(FRAMES)] for n in (2, 3, 5)])
+    np.testing.assert_array_equal(
+        parts.joined(work, "power"), [[n**k for k in range(FRAMES)] for n in (2, 3, 5)]
+    )
     assert parts.read(work[0], "number").tolist() == [2.0, 3.0]
     parts.remove()
     assert not folder.exists()
@@ -52,15 +57,27 @@ def test_interrupted_work_keeps_its_finished_parts(tmp_path, settings):
 def test_without_a_folder_the_arrays_stay_in_memory(count):
     work, parts = parts_of({"computed": []}), Parts("powers", Workers(count))
     parts.run(work)
-    np.testing.assert_array_equal(parts.joined(work, "power"), [[n**k for k in range(FRAMES)] for n in (2, 3, 5)])
+    np.testing.assert_array_equal(
+        parts.joined(work, "power"), [[n**k for k in range(FRAMES)] for n in (2, 3, 5)]
+    )
     assert parts.joined(work, "power", 8).shape == (3, 8)
-    other = [replace(part, work=partial(growing, ["7"] * len(part.names), {"computed": []})) for part in work]
+    other = [
+        replace(part, work=partial(growing, ["7"] * len(part.names), {"computed": []}))
+        for part in work
+    ]
     parts.run(other)  # other work with the same labels
-    assert [parts.read(part, "number").tolist() for part in (*other, *work)] == [[7.0] * 2, [7.0], [2.0, 3.0], [5.0]]
+    assert [parts.read(part, "number").tolist() for part in (*other, *work)] == [
+        [7.0] * 2,
+        [7.0],
+        [2.0, 3.0],
+        [5.0],
+    ]
 
 
 def test_shorter_trials_end_with_nan():
     joined = padded([np.ones((1, 2, 3)), np.ones((2, 4, 3))], 3)
     assert joined.shape == (3, 4, 3)
-    np.testing.assert_array_equal(np.isnan(joined[..., 0]), [[False] * 2 + [True] * 2, [False] * 4, [False] * 4])
+    np.testing.assert_array_equal(
+        np.isnan(joined[..., 0]), [[False] * 2 + [True] * 2, [False] * 4, [False] * 4]
+    )
     assert padded([np.ones((1, 2), int)]).dtype == int

@@ -25,7 +25,11 @@ class Experiment:
     def __init__(self, run_dir: Path) -> None:
         self.run_dir = run_dir
         self.ran: list[str] = []
-        self.settings: dict[str, dict[str, Any]] = {"generate": {"seed": 0}, "train": {"epochs": 5}, "report": {}}
+        self.settings: dict[str, dict[str, Any]] = {
+            "generate": {"seed": 0},
+            "train": {"epochs": 5},
+            "report": {},
+        }
         self.behaviour: dict[str, Callable[[resuming.StageContext], None]] = {}
 
     def work(self, context: resuming.StageContext) -> None:
@@ -65,7 +69,9 @@ def test_the_peak_of_memory_is_the_largest_of_all_stages(experiment):
     assert used["peak_memory_gib"] == pytest.approx(peak_memory_gib(), rel=0.1)
     path = experiment.run_dir / "stages" / "generate.json"
     write_json(path, json.loads(path.read_text()) | {"peak_memory_gib": 3.0})
-    assert resuming.resources_used(experiment.run_dir, ["generate", "train"])["peak_memory_gib"] == 3.0
+    assert (
+        resuming.resources_used(experiment.run_dir, ["generate", "train"])["peak_memory_gib"] == 3.0
+    )
     assert resuming.resources_used(experiment.run_dir, ["none"])["peak_memory_gib"] is None
     assert experiment.run() == []
 
@@ -115,7 +121,10 @@ class TestSkipping:
         assert experiment.run() == ["train"]
 
     def test_outputs_of_two_settings_are_never_mixed(self, experiment):
-        """Old outputs stay valid until new ones replace them; half replaced, they are valid for neither."""
+        """Old outputs stay valid until new ones replace them.
+
+        Half replaced, they are valid for neither.
+        """
 
         def two_outputs(context: resuming.StageContext) -> None:
             write_json(context.run_dir / "a.json", context.settings)
@@ -126,7 +135,10 @@ class TestSkipping:
 
         def run(x: int) -> list[str]:
             experiment.ran.clear()
-            resuming.run_stages([resuming.Stage("s", two_outputs, ("a.json", "b.json"), {"x": x})], experiment.run_dir)
+            resuming.run_stages(
+                [resuming.Stage("s", two_outputs, ("a.json", "b.json"), {"x": x})],
+                experiment.run_dir,
+            )
             return experiment.ran
 
         stop = False
@@ -140,9 +152,15 @@ class TestSkipping:
 
     def test_the_fingerprint_does_not_depend_on_the_order_of_keys(self):
         def of(upstream: str = "u", **changes: Any) -> str:
-            fields = {"name": "s", "function": print, "outputs": (), "settings": {"a": 1, "b": {"c": 2.0}}}
+            fields = {
+                "name": "s",
+                "function": print,
+                "outputs": (),
+                "settings": {"a": 1, "b": {"c": 2.0}},
+            }
             return resuming.fingerprint(
-                resuming.Stage(**{**fields, "upstream": ("before",), **changes}), {"before": upstream}
+                resuming.Stage(**{**fields, "upstream": ("before",), **changes}),
+                {"before": upstream},
             )
 
         assert of() == of(settings={"b": {"c": 2.0}, "a": 1})
@@ -161,7 +179,11 @@ class TestInterruption:
 
         experiment.behaviour["train"] = interrupt_after_a_while
         for _ in range(2):
-            refuses(resuming.StageInterrupted, r"in stage 'train' \(finished and kept: generate; ", experiment.run)
+            refuses(
+                resuming.StageInterrupted,
+                r"in stage 'train' \(finished and kept: generate; ",
+                experiment.run,
+            )
         experiment.behaviour["train"] = finish
         assert experiment.run() == ["train", "report"]
         assert experiment.seconds == {"generate": 0.0, "train": 65.0, "report": 0.0}
@@ -249,7 +271,9 @@ class TestProgress:
                 with Progress("reconstruct_resphys", 1650, unit, console=console) as bar:
                     clock[0] += 2.5
                     bar.advance(1650)
-            assert " ".join(line(5.0).split()) == "Reconstructing the missing forces 1,650 frames 5 s"
+            assert (
+                " ".join(line(5.0).split()) == "Reconstructing the missing forces 1,650 frames 5 s"
+            )
         assert ("1650/1650 frames" in stream.getvalue()) is terminal
 
     @pytest.mark.parametrize("terminal", [True, False])
@@ -257,7 +281,9 @@ class TestProgress:
         for seconds, shown in ((0.5, False), (1.5, True)):
             stream = io.StringIO()
             console = Console(file=stream, force_terminal=terminal)
-            with Progress("equilibrium", 9, "iterations at most", console=console, after=2.0) as bar:
+            with Progress(
+                "equilibrium", 9, "iterations at most", console=console, after=2.0
+            ) as bar:
                 for _ in range(3):
                     clock[0] += seconds
                     bar.advance()
@@ -265,7 +291,9 @@ class TestProgress:
         if not terminal:
             assert stream.getvalue() == "equilibrium: iteration 3 (limit 9), in 4 s\n"
 
-    @pytest.mark.parametrize(("terminal", "most"), [(True, 201), (False, 2)], ids=["terminal", "log"])
+    @pytest.mark.parametrize(
+        ("terminal", "most"), [(True, 201), (False, 2)], ids=["terminal", "log"]
+    )
     def test_most_calls_only_count(self, clock, terminal, most):
         """In 20 s a bar is drawn every 0.1 s at most, a line printed every 10 s."""
         described = []
@@ -289,19 +317,30 @@ class TestProgress:
 
 def test_stages_are_expected_to_take_as_long_as_the_last_time(tmp_path):
     """As stages of one name on the same body and data, in any folder beside this one."""
-    body = {"mesh": {"size": 0.01}, "data": {"kind": "release"}, "budget": "full", "time_step": 0.01}
+    body = {
+        "mesh": {"size": 0.01},
+        "data": {"kind": "release"},
+        "budget": "full",
+        "time_step": 0.01,
+    }
 
     def stage(**changes):
         return resuming.Stage("identify", lambda context: None, (), {**body, **changes})
 
     assert resuming.expected_seconds([stage()], tmp_path / "new") == {}
-    for number, (changes, seconds) in enumerate([({"seed": 1}, 80.0), ({"seed": 2}, 70.0), ({"budget": "quick"}, 5.0)]):
+    for number, (changes, seconds) in enumerate(
+        [({"seed": 1}, 80.0), ({"seed": 2}, 70.0), ({"budget": "quick"}, 5.0)]
+    ):
         resuming.run_stages([stage(**changes)], tmp_path / str(number))
         record = tmp_path / str(number) / "stages" / "identify.json"
         finished = f"2026-01-0{3 - number}T00:00:00+00:00"
-        record.write_text(json.dumps(json.loads(record.read_text()) | {"seconds": seconds, "finished": finished}))
+        record.write_text(
+            json.dumps(json.loads(record.read_text()) | {"seconds": seconds, "finished": finished})
+        )
     (tmp_path / "damaged" / "stages").mkdir(parents=True)
     (tmp_path / "damaged" / "stages" / "identify.json").write_text("{")
-    assert resuming.expected_seconds([stage(), replace(stage(), name="train")], tmp_path / "new") == {"identify": 80.0}
+    assert resuming.expected_seconds(
+        [stage(), replace(stage(), name="train")], tmp_path / "new"
+    ) == {"identify": 80.0}
     assert resuming.expected_seconds([stage(budget="quick")], tmp_path / "new") == {"identify": 5.0}
     assert resuming.expected_seconds([stage(mesh={"size": 0.02})], tmp_path / "new") == {}

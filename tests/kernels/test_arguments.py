@@ -1,4 +1,7 @@
-"""The order and the names of kernels' arguments: constants, in, out; what a kernel writes ends in `_out`."""
+"""The order and the names of kernels' arguments: constants, in, out.
+
+What a kernel writes ends in `_out`.
+"""
 
 import ast
 import functools
@@ -38,10 +41,20 @@ def kernels():
     made = [*map(importlib.import_module, names), point_kernels(MUSCLE), *map(set_kernels, (1, 3))]
     made += [make(wp.float64) for make in (lbfgs_kernels, tiled_kernels)]
     made += [solid_kernels(corotated.LAW)]
-    found = [kernel for holder in made for kernel in vars(holder).values() if isinstance(kernel, wp.Kernel)]
-    found += [make(wp.float64) for make in (accept_kernel, projection_kernel, scatter_kernel)] + [pair_kernel(3)]
+    found = [
+        kernel
+        for holder in made
+        for kernel in vars(holder).values()
+        if isinstance(kernel, wp.Kernel)
+    ]
+    found += [make(wp.float64) for make in (accept_kernel, projection_kernel, scatter_kernel)] + [
+        pair_kernel(3)
+    ]
     found += [make(corotated.LAW) for make in (cell_step, cell_tangent)]
-    return {(Path(inspect.getsourcefile(kernel.func)).name, kernel.func.__name__): kernel for kernel in found}
+    return {
+        (Path(inspect.getsourcefile(kernel.func)).name, kernel.func.__name__): kernel
+        for kernel in found
+    }
 
 
 def definition(function):
@@ -56,14 +69,18 @@ def is_array(kind):
 
 
 class Reader(ast.NodeVisitor):
-    """Finds which arguments of a function it writes: arrays, also those of structs and rows that have a name."""
+    """Finds which arguments of a function it writes:
+    arrays, also those of structs and rows that have a name.
+    """
 
     def __init__(self, types, names):
         self.places = {name: (name, kind) for name, kind in types.items()}
         self.names, self.written = names, set()
 
     def place(self, node):
-        """The argument that an expression is a part of, its type, and whether it is an entry of an array."""
+        """The argument that an expression is a part of,
+        its type, and whether it is an entry of an array.
+        """
         if isinstance(node, ast.Name):
             return (*self.places.get(node.id, (None, None)), False)
         if not isinstance(node, ast.Attribute | ast.Subscript):
@@ -79,7 +96,9 @@ class Reader(ast.NodeVisitor):
     def visit_Assign(self, node):
         (target,) = node.targets
         several = isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple)
-        for name, value in zip(target.elts, node.value.elts, strict=True) if several else [(target, node.value)]:
+        for name, value in (
+            zip(target.elts, node.value.elts, strict=True) if several else [(target, node.value)]
+        ):
             self.store(name)
             root, kind, _ = self.place(value)
             if isinstance(name, ast.Name) and is_array(kind):
@@ -100,29 +119,40 @@ class Reader(ast.NodeVisitor):
         text = ast.unparse(node.func)
         if "atomic" in text:
             self.written.add(self.place(node.args[0])[0])
-        if text.startswith("wp.") or text.endswith(".dtype"):  # such as wp.grad(energy)(f, v), or a conversion
+        if text.startswith("wp.") or text.endswith(".dtype"):
+            # Such as wp.grad(energy)(f, v), or a conversion.
             return
         called = eval(text, dict(self.names))
         if isinstance(called, wp.Function) and not called.is_builtin():
-            arguments = {n: self.place(value) for n, value in zip(called.input_types, node.args, strict=True)}
+            arguments = {
+                n: self.place(value) for n, value in zip(called.input_types, node.args, strict=True)
+            }
             types = {name: kind for name, (_, kind, _) in arguments.items()}
             self.written |= {arguments[name][0] for name in written_by(called, types)}
 
 
 def writes(statement, name):
-    """Whether a statement of C++ assigns to an array, or gives a name to its memory that is not constant."""
+    """Whether a statement of C++ assigns to an array,
+    or gives a name to its memory that is not constant.
+    """
     target, _, value = re.sub(r"[=!<>]=", "", statement).partition("=")
     named = value.strip() == f"{name}.data" and "const S*" not in target
     return named or (bool(value) and f"{name}.data[" in target)
 
 
 def written_by(function, types=None):
-    """Names of the arguments that a kernel, or a Warp function of arguments of some types, writes."""
+    """Names of arguments that a kernel, or a Warp function of arguments of some types, writes."""
     if code := getattr(function, "native_snippet", None):
-        return {name for name in function.input_types if any(writes(part, name) for part in re.split("[;{}]", code))}
+        return {
+            name
+            for name in function.input_types
+            if any(writes(part, name) for part in re.split("[;{}]", code))
+        }
     tree, names = definition(function.func)
     declared = {arg.label: arg.type for arg in function.adj.args}
-    reader = Reader({name: types[name] if kind is Any else kind for name, kind in declared.items()}, names)
+    reader = Reader(
+        {name: types[name] if kind is Any else kind for name, kind in declared.items()}, names
+    )
     for _ in range(2):  # A row may have its name in a loop.
         for statement in tree.body:
             reader.visit(statement)
@@ -132,8 +162,14 @@ def written_by(function, types=None):
 def test_every_kernel_of_the_folder_is_read():
     decorated = set()
     for path in FOLDER.rglob("*.py"):
-        functions = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.FunctionDef)]
-        marked = [n for n in functions if any("wp.kernel" in ast.unparse(mark) for mark in n.decorator_list)]
+        functions = [
+            n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.FunctionDef)
+        ]
+        marked = [
+            n
+            for n in functions
+            if any("wp.kernel" in ast.unparse(mark) for mark in n.decorator_list)
+        ]
         decorated |= {(path.name, n.name) for n in marked}
     assert decorated == set(kernels())
     assert len(decorated) > 60
@@ -146,7 +182,11 @@ def count(sums: Any, b: int):
 
 @wp.kernel
 def example(
-    named: wp.array2d[float], added: wp.array[int], through: wp.array2d[int], only_read: wp.array[wp.vec3], x: wp.vec3
+    named: wp.array2d[float],
+    added: wp.array[int],
+    through: wp.array2d[int],
+    only_read: wp.array[wp.vec3],
+    x: wp.vec3,
 ):
     i = wp.tid()
     row = named[i]

@@ -1,4 +1,6 @@
-"""Energy densities of every material: derivatives, the state at rest, and invariance under rotation."""
+"""Energy densities of every material: derivatives, the state at rest,
+and invariance under rotation.
+"""
 
 import functools
 
@@ -24,9 +26,17 @@ TERMS = (3.0, 2.0, 1.5, 1.0, 0.7, 0.4, BULK, 3.0, 1.0, 1.0)
 OGDEN = {3: 2.0, -4: 1.5, 6: 0.5}
 AXES = ((0.6, 0.0, 0.8), (0.48, 0.6, -0.64))
 LAWS["convex"] = (convex_law((), 0), TERMS, (8.0, 2.0 * BULK + 0.8))
-LAWS["Ogden"] = (convex_law(tuple(OGDEN), 0), (*TERMS, *OGDEN.values()), (12.0, 2.0 * BULK + 0.8 + 1.5))
+LAWS["Ogden"] = (
+    convex_law(tuple(OGDEN), 0),
+    (*TERMS, *OGDEN.values()),
+    (12.0, 2.0 * BULK + 0.8 + 1.5),
+)
 STRETCHED = {3: 2.0, 4: 1.5, 5: 1.0, 6: 0.5, 8: 0.25}  # without an SVD, where F is not inverted
-LAWS["Ogden in tension"] = (convex_law(tuple(STRETCHED), 0), (*TERMS, *STRETCHED.values()), (13.25, 2.0 * BULK + 0.8))
+LAWS["Ogden in tension"] = (
+    convex_law(tuple(STRETCHED), 0),
+    (*TERMS, *STRETCHED.values()),
+    (13.25, 2.0 * BULK + 0.8),
+)
 FIBRES = "convex with two families of fibres"
 ISOTROPIC = tuple(LAWS)
 LAWS[FIBRES] = (
@@ -35,7 +45,9 @@ LAWS[FIBRES] = (
     None,
 )
 RANDOM = np.random.default_rng(0)
-GRADIENTS = np.concatenate([np.eye(3)[None], *(np.eye(3) + s * RANDOM.normal(size=(10, 3, 3)) for s in (0.02, 0.2))])
+GRADIENTS = np.concatenate(
+    [np.eye(3)[None], *(np.eye(3) + s * RANDOM.normal(size=(10, 3, 3)) for s in (0.02, 0.2))]
+)
 DIRECTION = RANDOM.normal(size=GRADIENTS.shape)
 
 
@@ -47,9 +59,15 @@ def kernel_of(name):
 
     @wp.kernel(module=module)
     def evaluate(
-        f: wp.array[wp.mat33d], df: wp.array[wp.mat33d], m: law.values, clamp: bool, energy_out: wp.array[wp.float64],
-        stress_out: wp.array[wp.mat33d], slopes_out: wp.array[law.values], tangent_out: wp.array2d[wp.mat33d],
-    ):  # fmt: skip
+        f: wp.array[wp.mat33d],
+        df: wp.array[wp.mat33d],
+        m: law.values,
+        clamp: bool,
+        energy_out: wp.array[wp.float64],
+        stress_out: wp.array[wp.mat33d],
+        slopes_out: wp.array[law.values],
+        tangent_out: wp.array2d[wp.mat33d],
+    ):
         i = wp.tid()
         energy, stress = law.response(f[i], m)
         energy_out[i] = energy
@@ -63,10 +81,17 @@ def kernel_of(name):
 def response(name, f=GRADIENTS, moduli=None, clamp=False):
     """Energies (B), stresses (B, 3, 3), slopes (B, n) and tangents (B, 9, 9)."""
     law, own, _ = LAWS[name]
-    sizes = [(len(f), wp.float64), (len(f), wp.mat33d), (len(f), law.values), ((len(f), 6), wp.mat33d)]
+    sizes = [
+        (len(f), wp.float64),
+        (len(f), wp.mat33d),
+        (len(f), law.values),
+        ((len(f), 6), wp.mat33d),
+    ]
     out = [wp.zeros(size, dtype=kind, device="cpu") for size, kind in sizes]
     fields = [wp.array(field, dtype=wp.mat33d, device="cpu") for field in (f, DIRECTION)]
-    wp.launch(kernel_of(name), len(f), [*fields, law.values(*(moduli or own)), clamp, *out], device="cpu")
+    wp.launch(
+        kernel_of(name), len(f), [*fields, law.values(*(moduli or own)), clamp, *out], device="cpu"
+    )
     energy, stress, slopes, blocks = (array.numpy() for array in out)
     tangent = np.zeros((len(f), 3, 3, 3, 3))  # column and row of the stress, column and row of F
     for number, (k, n) in enumerate([(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]):
@@ -86,17 +111,23 @@ def test_stress_and_tangent_are_derivatives(name):
     ahead, behind = (response(name, GRADIENTS + s * step * DIRECTION) for s in (1, -1))
     slope = np.einsum("nij,nij->n", stress, DIRECTION)
     smooth = slice(name == FIBRES, None)  # The modulus of fibres jumps at rest.
-    np.testing.assert_allclose((ahead[0] - behind[0])[smooth] / (2 * step), slope[smooth], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        (ahead[0] - behind[0])[smooth] / (2 * step), slope[smooth], rtol=1e-6, atol=1e-6
+    )
     product = np.einsum("nij,nj->ni", tangent, flat(DIRECTION))
     difference = flat(ahead[1] - behind[1]) / (2 * step)
     np.testing.assert_allclose(difference[smooth], product[smooth], rtol=1e-5, atol=1e-5)
     if name == FIBRES:  # Both parts of the tangent are clamped by themselves.
-        assert np.linalg.eigvalsh(response(name, clamp=True)[3]).min() > -1e-8 * np.abs(tangent).max()
+        assert (
+            np.linalg.eigvalsh(response(name, clamp=True)[3]).min() > -1e-8 * np.abs(tangent).max()
+        )
         return
     values, vectors = np.linalg.eigh(tangent)
     assert (values < -0.1).any()
     clamped = np.einsum("nij,nj,nkj->nik", vectors, values.clip(0.0), vectors)
-    np.testing.assert_allclose(response(name, clamp=True)[3], clamped, atol=1e-8 * np.abs(tangent).max())
+    np.testing.assert_allclose(
+        response(name, clamp=True)[3], clamped, atol=1e-8 * np.abs(tangent).max()
+    )
 
 
 @pytest.mark.parametrize("name", LAWS)
@@ -106,12 +137,15 @@ def test_slopes_are_the_derivatives_of_the_stress_by_the_moduli(name):
     for k in range(4 if name == "gent" else 0, len(moduli)):  # Those before are volumes.
         step = 1e-4 * max(abs(moduli[k]), 0.01)
         ahead, behind = (
-            response(name, moduli=tuple(m + s * step * (i == k) for i, m in enumerate(moduli)))[1] for s in (1, -1)
+            response(name, moduli=tuple(m + s * step * (i == k) for i, m in enumerate(moduli)))[1]
+            for s in (1, -1)
         )
         expected = np.einsum("nij,nij->n", ahead - behind, DIRECTION) / (2 * step)
         smooth = slice(name == FIBRES, None)
         scale = max(np.abs(expected).max(), 1.0)
-        np.testing.assert_allclose(slopes[smooth, k], expected[smooth], rtol=1e-6, atol=1e-7 * scale)
+        np.testing.assert_allclose(
+            slopes[smooth, k], expected[smooth], rtol=1e-6, atol=1e-7 * scale
+        )
 
 
 @pytest.mark.parametrize("name", ISOTROPIC)
@@ -122,7 +156,9 @@ def test_at_rest_it_is_linear_elasticity(name):
     mu, lame_lambda = LAWS[name][2]
     strain = 0.5 * (DIRECTION[0] + DIRECTION[0].T)
     expected = 2.0 * mu * strain + lame_lambda * np.trace(strain) * np.eye(3)
-    np.testing.assert_allclose((tangent @ DIRECTION[0].T.ravel()).reshape(3, 3).T, expected, atol=1e-7)
+    np.testing.assert_allclose(
+        (tangent @ DIRECTION[0].T.ravel()).reshape(3, 3).T, expected, atol=1e-7
+    )
 
 
 @pytest.mark.parametrize("name", LAWS)
@@ -157,4 +193,6 @@ def test_ogdens_rubber_is_the_closed_form():
     turn, before = Rotation.random(2, rng=np.random.default_rng(3)).as_matrix()
     f = np.stack([turn @ np.diag(s) @ before for s in stretches])
     expected = sum(2.0 * mu / a**2 * ((stretches**a).sum(axis=1) - 3.0) for a, mu in OGDEN.items())
-    np.testing.assert_allclose(response("Ogden", f, (*[0.0] * 10, *OGDEN.values()))[0], expected, rtol=1e-10)
+    np.testing.assert_allclose(
+        response("Ogden", f, (*[0.0] * 10, *OGDEN.values()))[0], expected, rtol=1e-10
+    )

@@ -48,10 +48,18 @@ def test_launches_are_on_the_stream_of_torch(device):
 @pytest.mark.parametrize("box", [box_hexahedra, box_tetrahedra])
 def test_a_solve_launches_the_modules_that_were_compiled_together(law, box, monkeypatch):
     together, recorded = set(), set()
-    monkeypatch.setattr(workspace, "compile_together", lambda kernels, *_: together.update(k.module for k in kernels))
+    monkeypatch.setattr(
+        workspace,
+        "compile_together",
+        lambda kernels, *_: together.update(k.module for k in kernels),
+    )
     for name in ("record", "record_blocks"):
         before = getattr(Launcher, name)
-        note = lambda own, kernel, *rest, _to=before: (recorded.add(kernel.module), _to(own, kernel, *rest))[1]  # noqa: E731
+
+        def note(own, kernel, *rest, _to=before):
+            recorded.add(kernel.module)
+            return _to(own, kernel, *rest)
+
         monkeypatch.setattr(Launcher, name, note)
     simulator = Simulator(clamped(box((0.1, 0.02, 0.02), (4, 1, 1))), law)
     simulator.step(simulator.rest_state())
@@ -70,7 +78,9 @@ simulator.rollout(simulator.rest_state(), 2)
 @pytest.mark.slow
 def test_a_script_whose_kernels_are_compiled_prints_nothing():
     for _ in range(2):
-        run = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
+        run = subprocess.run(
+            [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True
+        )
     assert run.stdout == ""
 
 
@@ -78,8 +88,16 @@ def test_a_script_whose_kernels_are_compiled_prints_nothing():
     ("message", "shown"),
     [
         ("Warp 1.19.0 initialized:\n   CUDA Toolkit 13.4", False),
-        ("Module warp_resphys.kernels.elasticity d4f30f6 load on device 'cpu' took 0.26 ms  (cached)", False),
-        ("Module warp_resphys.kernels.elasticity d4f30f6 load on device 'cpu' took 5120.26 ms  (compiled)", True),
+        (
+            "Module warp_resphys.kernels.elasticity d4f30f6 load "
+            "on device 'cpu' took 0.26 ms  (cached)",
+            False,
+        ),
+        (
+            "Module warp_resphys.kernels.elasticity d4f30f6 load "
+            "on device 'cpu' took 5120.26 ms  (compiled)",
+            True,
+        ),
         ("Module my_kernels d4f30f6 load on device 'cpu' took 0.26 ms  (cached)", True),
     ],
 )

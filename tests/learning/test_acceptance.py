@@ -1,4 +1,6 @@
-"""Learned forces that are accurate and yet refused: without equilibrium, away from rest, or felt by a sensor."""
+"""Learned forces that are accurate and yet refused:
+without equilibrium, away from rest, or felt by a sensor.
+"""
 
 from dataclasses import replace
 
@@ -20,7 +22,9 @@ STEPS = 20
 
 
 class HandMade(torch.nn.Module):
-    """A force at the tip as a function of its height and of the inputs, in place of a trained network."""
+    """A force at the tip as a function of its height and of the inputs,
+    in place of a trained network.
+    """
 
     def __init__(self, push, acts="internal"):
         super().__init__()
@@ -41,7 +45,9 @@ class HandMade(torch.nn.Module):
 def recorded():
     """A beam at rest that a tendon then bends, which stays bent; a force sensor at its clamp."""
     simulator = wr.Simulator(
-        clamped(MESH, energies=[CABLE]), wr.Corotated(264e3, 0.45, stiffness_damping=0.2), time_step=0.05
+        clamped(MESH, energies=[CABLE]),
+        wr.Corotated(264e3, 0.45, stiffness_damping=0.2),
+        time_step=0.05,
     )
     ramp = torch.linspace(0.0, 1.0, STEPS, dtype=torch.float64).mul(4.0).clamp_max(1.0)
     tension = ramp[:, None, None] * torch.tensor([[0.5], [1.0]], dtype=torch.float64)
@@ -49,7 +55,9 @@ def recorded():
     start = simulator.static_equilibrium(resting)
     motion = simulator.rollout(start, STEPS, wr.Inputs(tendon_tension=tension))
     clamp = wr.ForceSensor(axes=("fx", "fy", "fz"), noise=1e-3)
-    read = torch.stack([clamp(simulator.reaction(start)), *(clamp(one) for one in _by_step(motion))])
+    read = torch.stack(
+        [clamp(simulator.reaction(start)), *(clamp(one) for one in _by_step(motion))]
+    )
     given = {"resting": resting, "inputs": wr.Inputs(tendon_tension=tension)}
     given |= {"sensors": {"clamp": clamp}, "loads": {"clamp": read}}
     return simulator, ObservedMotions.of(simulator, motion.q, **given)
@@ -65,7 +73,9 @@ def objections(recorded, push, acts="internal", sensing=False):
     if not sensing:
         motions = replace(motions, sensors={}, trials=replace(motions.trials, loads={}))
     names = motions.trials.names
-    return Acceptance(simulator, motions, Identified(), 0.3).objections(Learned(HandMade(push, acts)), names, names)
+    return Acceptance(simulator, motions, Identified(), 0.3).objections(
+        Learned(HandMade(push, acts)), names, names
+    )
 
 
 def turning(inputs, where):
@@ -74,7 +84,10 @@ def turning(inputs, where):
 
 
 def test_a_small_force_is_accepted(recorded):
-    assert objections(recorded, lambda inputs: 1e-4 * torch.ones(len(inputs), dtype=torch.float64)) == []
+    assert (
+        objections(recorded, lambda inputs: 1e-4 * torch.ones(len(inputs), dtype=torch.float64))
+        == []
+    )
 
 
 def test_a_force_without_equilibrium_at_rest_is_refused(recorded):
@@ -89,13 +102,23 @@ def test_a_force_without_equilibrium_under_the_inputs_of_one_trial_is_refused(re
     simulator, _ = recorded
     pulled = wr.Inputs(tendon_tension=torch.ones(1, 1, dtype=torch.float64))
     height = float(simulator.static_equilibrium(pulled).q[0, TIP, 2].mean())
-    (only,) = objections(recorded, lambda inputs: torch.where(inputs[:, 1] > 0.8, turning(inputs, height), 0.0))
-    assert only == "under constant inputs of the training ('motion 1') the robot has no equilibrium with it"
+    (only,) = objections(
+        recorded, lambda inputs: torch.where(inputs[:, 1] > 0.8, turning(inputs, height), 0.0)
+    )
+    assert (
+        only
+        == "under constant inputs of the training ('motion 1') the robot has no equilibrium with it"
+    )
 
 
 def test_a_force_that_moves_a_resting_body_is_refused(recorded):
-    found = objections(recorded, lambda inputs: torch.full((len(inputs),), 0.05, dtype=torch.float64))
-    assert [text.split(" the robot is ")[0] for text in found] == ["at rest", "under constant inputs of the training"]
+    found = objections(
+        recorded, lambda inputs: torch.full((len(inputs),), 0.05, dtype=torch.float64)
+    )
+    assert [text.split(" the robot is ")[0] for text in found] == [
+        "at rest",
+        "under constant inputs of the training",
+    ]
     assert all(text.endswith(" mm without") for text in found)
 
 
@@ -107,6 +130,8 @@ def test_a_force_that_a_sensor_would_feel_is_refused(recorded):
 
 
 def test_the_refusal_is_in_the_test():
-    test = HeldOutTest(trials=["a"], split="validation", error_mm=1.0, below_mm=2.0, used=False, refused=["why"])
+    test = HeldOutTest(
+        trials=["a"], split="validation", error_mm=1.0, below_mm=2.0, used=False, refused=["why"]
+    )
     assert text_of(test).endswith("2 mm; it is refused: why")
     assert not np.isnan(test["error_mm"])

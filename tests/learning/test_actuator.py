@@ -24,7 +24,9 @@ from warp_resphys.learning.residuals.linearised import Linearised, chosen_penalt
 from warp_resphys.settings.learning import ActuatorSettings
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
-ROUTES = {side: [[x, y, 0.02] for x in (0.0, 0.05, 0.1)] for side, y in (("left", 0.0), ("right", 0.02))}
+ROUTES = {
+    side: [[x, y, 0.02] for x in (0.0, 0.05, 0.1)] for side, y in (("left", 0.0), ("right", 0.02))
+}
 BODY = wr.Body(MESH, fixed=wr.select_vertices(MESH, x=0.0), energies=[wr.Tendons(ROUTES)])
 MARKERS = wr.bind_markers(
     MESH, np.array([[0.1, 0.01, 0.022], [0.06, 0.01, 0.022], [0.1, 0.022, 0.01]]), ["a", "b", "c"]
@@ -65,7 +67,9 @@ def observed(simulator, commands, effective):
     q = simulator.rollout(start, STEPS, wr.Inputs(tendon_tension=effective)).q
     seen = torch.stack([MARKERS(positions) for positions in q])
     resting = wr.Inputs(tendon_tension=commands[0])
-    return ObservedMotions.of(simulator, seen, None, wr.Inputs(tendon_tension=commands), resting, observation=MARKERS)
+    return ObservedMotions.of(
+        simulator, seen, None, wr.Inputs(tendon_tension=commands), resting, observation=MARKERS
+    )
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +89,9 @@ OTHERS = ("motion 4", "motion 5")
 
 def trained():
     """A network with weights, and the values that it was made for."""
-    values = torch.tensor([1.0, 2.0, 1.0, 2.0]) * torch.rand(50, 4, generator=torch.Generator().manual_seed(0))
+    values = torch.tensor([1.0, 2.0, 1.0, 2.0]) * torch.rand(
+        50, 4, generator=torch.Generator().manual_seed(0)
+    )
     network = InputNetwork.of_training(values, (0.1,), 12)
     torch.manual_seed(0)
     torch.nn.init.normal_(network.weights, std=0.3)
@@ -96,16 +102,22 @@ def test_an_untrained_network_changes_nothing_and_zero_inputs_never_change():
     network, values = trained()
     assert not InputNetwork.of_training(values, (0.1,), 12)(values).any()
     assert network(values).abs().mean() > 1e-2
-    torch.testing.assert_close(network(torch.zeros(1, 4, dtype=torch.float64)), torch.zeros(1, 2).double())
+    torch.testing.assert_close(
+        network(torch.zeros(1, 4, dtype=torch.float64)), torch.zeros(1, 2).double()
+    )
 
 
 def test_weights_are_those_of_a_gaussian_process_that_is_zero_at_zero():
-    """The covariance of two values under random weights of unit variance, at centres, where the basis is exact."""
+    """The covariance of two values under random weights of unit variance,
+    at centres, where the basis is exact.
+    """
     network, _ = trained()
     functions = functions_of(network, network.unit * network.centres) / network.unit
     found = functions @ functions.T
     a, b = network.centres[:, None], network.centres[None]
-    kernel = [torch.exp(-0.5 * (x - y).square().sum(-1)) for x, y in ((a, b), (a, 0.0 * b), (0.0 * a, b))]
+    kernel = [
+        torch.exp(-0.5 * (x - y).square().sum(-1)) for x, y in ((a, b), (a, 0.0 * b), (0.0 * a, b))
+    ]
     torch.testing.assert_close(found, kernel[0] - kernel[1] * kernel[2], atol=1e-4, rtol=0.0)
 
 
@@ -115,7 +127,8 @@ def test_a_network_fades_beyond_the_values_of_the_training():
     away = values[values.norm(dim=1).argmax()] - mean
     torch.testing.assert_close(network(mean + 1e4 * away), 1e-2 * network(mean + 1e3 * away))
     x = (values - mean) / network.unit
-    assert float(((x @ network.precision) * x).sum(1).max()) == pytest.approx(0.5)  # It fades from the double on.
+    # It fades from the double on.
+    assert float(((x @ network.precision) * x).sum(1).max()) == pytest.approx(0.5)
 
 
 def test_the_centres_of_few_poses_are_these():
@@ -143,7 +156,9 @@ def test_a_series_at_once_is_the_series_step_by_step_and_settles_at_the_still_in
     held = commands[:1].expand(400, -1, -1)
     settled, mean, _ = response(response.steady(0.0 * commands[0]), held)
     torch.testing.assert_close(settled[-1], response.still(commands[0]))
-    torch.testing.assert_close(response.steady(commands[0])["means"][0], mean[0, -1], rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(
+        response.steady(commands[0])["means"][0], mean[0, -1], rtol=1e-5, atol=1e-7
+    )
 
 
 def test_the_actuator_is_learned_and_predicts_other_motions(simulator, motions, learned):
@@ -165,7 +180,9 @@ def test_an_actuator_that_has_nothing_to_learn_is_not_used(simulator):
     commands = tensions()
     motions = observed(simulator, commands, commands)
     noise = 1e-3 * np.random.default_rng(0).standard_normal(motions.trials.observed.shape)
-    motions = replace(motions, trials=replace(motions.trials, observed=motions.trials.observed + noise))
+    motions = replace(
+        motions, trials=replace(motions.trials, observed=motions.trials.observed + noise)
+    )
     found = fit_actuator(simulator, motions, train=FEW, settings=QUICK.changed(epochs=1))
     assert not found.test["used"]
     assert (found.test["split"], len(found.test["trials"])) == ("left-out training", len(FEW))
@@ -173,7 +190,9 @@ def test_an_actuator_that_has_nothing_to_learn_is_not_used(simulator):
 
 @pytest.mark.usefixtures("given_penalty")
 def test_trials_of_several_sessions_are_tested_under_their_own_names(simulator, motions):
-    """Errors of trials left out in turn, of sessions that alternate, and a session that is never driven."""
+    """Errors of trials left out in turn, of sessions that alternate,
+    and a session that is never driven.
+    """
     inputs = {"tendon_tension": motions.trials.inputs["tendon_tension"].copy()}
     inputs["tendon_tension"][1] = 0.0
     trials = replace(motions.trials, sessions=("a", "b") * (TRIALS // 2), inputs=inputs)
@@ -185,7 +204,9 @@ def test_trials_of_several_sessions_are_tested_under_their_own_names(simulator, 
     assert not left_out_in_turn(trials, names[:-1], names[-1:])
     _, test = fitting._held_out(folds, QUICK.changed(epochs=1), "fit")
     assert sorted(test["trials"]) == sorted(names)
-    below = dict(zip(fitting._in_batches(names), fitting._rolled_out(Identified(), names), strict=True))
+    below = dict(
+        zip(fitting._in_batches(names), fitting._rolled_out(Identified(), names), strict=True)
+    )
     losses = [fitting._loss(fold) for fold in folds]
     for fold, loss in zip(folds, losses, strict=True):
         loss.error_mm(None)
@@ -199,14 +220,18 @@ def test_known_starts_and_a_part_of_each_trial_can_be_learned_from(simulator, mo
     initial = torch.stack([start.q, start.v], 1).numpy()
     given = replace(motions.trials, begins=("given",) * TRIALS, initial=initial)
     part = replace(motions, trials=given, train_fraction=0.73)
-    found = fit_actuator(simulator, part, train=FEW, validation=["motion 3"], settings=QUICK.changed(epochs=1))
+    found = fit_actuator(
+        simulator, part, train=FEW, validation=["motion 3"], settings=QUICK.changed(epochs=1)
+    )
     assert found.test["error_mm"] < found.test["below_mm"]
 
 
 @pytest.mark.usefixtures("given_penalty")
 def test_a_network_may_take_the_inputs_alone_and_obstacles_are_no_actuators(simulator, motions):
     settings = QUICK.changed(filters=(), epochs=1)
-    found = fit_actuator(simulator, motions, train=FEW[1:], validation=["motion 0"], settings=settings)
+    found = fit_actuator(
+        simulator, motions, train=FEW[1:], validation=["motion 0"], settings=settings
+    )
     assert found.test["error_mm"] < found.test["below_mm"]
     response = InputResponse(STEP, network=found.actuator["tendon_tension"])
     commands = tensions()
@@ -215,14 +240,20 @@ def test_a_network_may_take_the_inputs_alone_and_obstacles_are_no_actuators(simu
     floor = wr.Body(MESH, fixed=BODY.fixed_vertices, energies=[wr.Contact({"wall": wall})])
     bare = wr.Simulator(floor, wr.Corotated(264e3, 0.45), time_step=STEP)
     q = bare.rollout(bare.rest_state(), 3).q
-    moved = ObservedMotions.of(bare, q, bare.rest_state(), wr.Inputs(obstacle_move_z=torch.zeros(3, 1, 1).double()))
+    moved = ObservedMotions.of(
+        bare, q, bare.rest_state(), wr.Inputs(obstacle_move_z=torch.zeros(3, 1, 1).double())
+    )
     refuses(InputError, "no inputs whose actuator could be learned", fit_actuator, bare, moved)
 
 
-def test_derivatives_by_parameters_are_those_of_the_motion_with_the_actuator(simulator, motions, learned):
+def test_derivatives_by_parameters_are_those_of_the_motion_with_the_actuator(
+    simulator, motions, learned
+):
     alone = Identification({"youngs_modulus": 264e3})
     both = replace(alone, actuator=learned.actuator), alone
-    points = [sensitivities(simulator, motions, ["motion 4"], one)["motion 4"].points for one in both]
+    points = [
+        sensitivities(simulator, motions, ["motion 4"], one)["motion 4"].points for one in both
+    ]
     replay = motions.replay(simulator, ["motion 4"], learned)
     shown = replay(motions.start(replay, learned))
     np.testing.assert_allclose(points[0], shown[0, 0].numpy(), atol=1e-6)
@@ -236,14 +267,22 @@ def test_poses_at_rest_teach_what_acts_in_the_end(simulator):
     given = wr.Inputs(tendon_tension=commands)
     motions = ObservedMotions.of(simulator, seen, None, given, given, observation=MARKERS)
     rest = MARKERS(simulator.rest_state(8).q).numpy()
-    trials = replace(motions.trials, begins=("static",) * 8, times=0.0 * motions.trials.times, held=rest)
+    trials = replace(
+        motions.trials, begins=("static",) * 8, times=0.0 * motions.trials.times, held=rest
+    )
     motions = replace(motions, trials=trials)
     poses = trials.names
     found = fit_actuator(simulator, motions, train=poses[:6], validation=poses[6:7], settings=QUICK)
-    errors = [evaluate(simulator, motions, names=poses[7:], parameters=one)[0].mean() for one in (None, found)]
+    errors = [
+        evaluate(simulator, motions, names=poses[7:], parameters=one)[0].mean()
+        for one in (None, found)
+    ]
     assert errors[1] < 0.5 * errors[0]
     # One pose has no spread, so that training poses are left out in turn.
-    assert (found.test["split"], sorted(found.test["trials"])) == ("left-out training", sorted(poses[:6]))
+    assert (found.test["split"], sorted(found.test["trials"])) == (
+        "left-out training",
+        sorted(poses[:6]),
+    )
     assert not left_out_in_turn(trials, poses[:6], poses[6:8])
     # A fold that leaves no pose with inputs would have nothing to fit.
     alone = {"tendon_tension": np.zeros_like(trials.inputs["tendon_tension"])}
@@ -262,7 +301,9 @@ def test_training_that_was_interrupted_goes_on_as_if_it_had_not_been(simulator, 
     fitting.fit(QUICK.changed(epochs=1), save=kept.append)
     again, resumed = fitting.fit(two, resumed=kept[-1])
     assert resumed["epochs"] == training["epochs"]
-    torch.testing.assert_close(again.actuator["tendon_tension"].weights, whole.actuator["tendon_tension"].weights)
+    torch.testing.assert_close(
+        again.actuator["tendon_tension"].weights, whole.actuator["tendon_tension"].weights
+    )
 
 
 @pytest.fixture(scope="module")
@@ -271,7 +312,13 @@ def linearised_motions(simulator, motions):
     ((replay, start),) = ActuatorFitting(simulator, motions, FEW)._replays(FEW)
     felt = felt_inputs(replay, {}, QUICK.filters)
     (values,) = felt.values()
-    model = Actuator({"tendon_tension": InputNetwork.of_training(values.flatten(0, 1), QUICK.filters, QUICK.centres)})
+    model = Actuator(
+        {
+            "tendon_tension": InputNetwork.of_training(
+                values.flatten(0, 1), QUICK.filters, QUICK.centres
+            )
+        }
+    )
     return Linearised.of(replay, start, {}, model, felt), model, replay, start
 
 
@@ -288,7 +335,9 @@ def test_the_penalty_grows_with_the_noise_and_the_model_stays(linearised_motions
 def test_linearised_motions_follow_changes_of_the_inputs_in_time(linearised_motions):
     one, model, replay, start = linearised_motions
     before = one.errors(one.changes(model))
-    model = Actuator({"tendon_tension": network_of(lambda values: 2e-3 * values[:, :2], 1.0, 2, QUICK.filters)})
+    model = Actuator(
+        {"tendon_tension": network_of(lambda values: 2e-3 * values[:, :2], 1.0, 2, QUICK.filters)}
+    )
     exact = replay.errors(replay.changed(actuator=model.inputs)(start))[0] - before
     changes = one.changes(model)
     at_once = replace(one, kernel=torch.ones(1).double()).errors(changes) - before
@@ -298,7 +347,15 @@ def test_linearised_motions_follow_changes_of_the_inputs_in_time(linearised_moti
 
 
 def test_trials_without_inputs_are_refused(simulator):
-    bare = wr.Simulator(wr.Body(MESH, fixed=BODY.fixed_vertices), wr.Corotated(264e3, 0.45), time_step=STEP)
+    bare = wr.Simulator(
+        wr.Body(MESH, fixed=BODY.fixed_vertices), wr.Corotated(264e3, 0.45), time_step=STEP
+    )
     q = bare.rollout(bare.rest_state(), 4).q
     motions = ObservedMotions.of(bare, q, bare.rest_state())
-    refuses(InputError, "motion 0 have no inputs whose actuator could be learned", fit_actuator, bare, motions)
+    refuses(
+        InputError,
+        "motion 0 have no inputs whose actuator could be learned",
+        fit_actuator,
+        bare,
+        motions,
+    )

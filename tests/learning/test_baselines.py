@@ -29,11 +29,14 @@ def motions(values, inputs=None, *, first=None, origin=None, known=None):
 
 
 def steps(levels, response):
-    """PlainTrials that follow steps of an input: a curve of the level times a response over time."""
+    """PlainTrials that follow steps of an input: a curve
+    of the level times a response over time.
+    """
     levels = np.asarray(levels)
     shape = np.array([1.0, 0.5, -0.2]) * (1.0 - np.exp(-TIMES / 0.2))[:, None]
     return motions(
-        response(levels)[:, None, None] * shape, np.broadcast_to(levels[:, None, None], (len(levels), FRAMES, 1))
+        response(levels)[:, None, None] * shape,
+        np.broadcast_to(levels[:, None, None], (len(levels), FRAMES, 1)),
     )
 
 
@@ -49,7 +52,8 @@ def test_between_two_levels_interpolation_is_a_straight_line_and_below_them_one_
 
 
 @pytest.mark.parametrize(
-    ("kind", "response"), [("linear, ridge", lambda x: 0.7 * x), ("quadratic, ridge", lambda x: 0.3 * x + 0.2 * x**2)]
+    ("kind", "response"),
+    [("linear, ridge", lambda x: 0.7 * x), ("quadratic, ridge", lambda x: 0.3 * x + 0.2 * x**2)],
 )
 def test_regression_finds_the_form_by_leaving_trials_out_and_extrapolates_with_it(kind, response):
     trials, asked = steps([0.5, 0.8, 1.0, 1.5, 2.0], response), steps([3.0], response)
@@ -81,10 +85,15 @@ def test_a_coordinate_that_some_trials_do_not_show_is_predicted_from_the_others(
 
 
 def driven(seed, count=4, frames=200):
-    """Two damped oscillators, seen by three coordinates and driven by two inputs that change all the time."""
+    """Two damped oscillators, seen by three coordinates and driven by two inputs
+    that change all the time.
+    """
     random = np.random.default_rng(seed)
     inputs = np.cumsum(0.2 * random.normal(size=(count, frames, 2)), axis=1)
-    turn = lambda a, r: r * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])  # noqa: E731
+
+    def turn(a, r):
+        return r * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+
     matrix = np.zeros((4, 4))
     matrix[:2, :2], matrix[2:, 2:] = turn(0.3, 0.95), turn(0.8, 0.9)
     push = np.array([[0.0, 1.0, 0.0, 0.5], [0.3, 0.0, 0.0, 1.0]])
@@ -109,7 +118,10 @@ def test_a_model_linear_in_time_finds_the_degree_of_its_inputs():
 
 
 def lagging(seed, *, before, count=5, frames=300):
-    """A body behind two inputs, by 0.1 s with their squares and by 3 s; it rests under the first or none."""
+    """A body behind two inputs, by 0.1 s with their squares and by 3 s.
+
+    It rests under the first or none.
+    """
     random = np.random.default_rng(seed)
     inputs = np.repeat(random.normal(size=(count, 10, 2)), frames // 10, axis=1)
     begin = inputs[:, 0] if before else 0.0 * inputs[:, 0]
@@ -153,11 +165,12 @@ def test_a_coordinate_that_a_trial_never_shows_follows_from_the_others():
     trials.values[1:, :, :2] = np.nan  # No coordinate is common to all of them.
     asked.first[:, 1:] = np.nan
     assert (
-        np.abs((predictions(trials, asked)["linear"].values - asked.values)[..., 0]).max() < 0.03 * asked.values.max()
+        np.abs((predictions(trials, asked)["linear"].values - asked.values)[..., 0]).max()
+        < 0.03 * asked.values.max()
     )
 
 
-def test_a_single_trial_is_a_line_from_zero_inputs_and_trials_that_nothing_distinguishes_have_their_mean():
+def test_a_single_trial_is_a_line_from_zero_inputs_and_trials_that_are_alike_have_their_mean():
     assert error("interpolation", steps([2.0], lambda x: x), steps([0.5, 1.5], lambda x: x)) < 1e-6
     pose = motions(np.ones((4, 1, 3)), np.arange(4.0).reshape(4, 1, 1))
     assert [*predictions(pose, pose)] == ["rest", "interpolation", "regression"]

@@ -1,4 +1,6 @@
-"""Training of a correction, and roll-outs with it of which some diverge, in place of a simulator or under feedback."""
+"""Training of a correction, and roll-outs with it of which some diverge,
+in place of a simulator or under feedback.
+"""
 
 import math
 from dataclasses import replace
@@ -8,7 +10,16 @@ import pytest
 import torch
 
 from support.slopes import check_slopes
-from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Simulator,
+    SolverSettings,
+    State,
+    box_hexahedra,
+    select_vertices,
+)
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.residuals import correction
@@ -34,9 +45,13 @@ class LinearSystem:
 
     def __init__(self):
         random = np.random.default_rng(0)
-        shapes = np.linalg.qr(random.normal(size=(REST.numel(), 2 * MODES)))[0].T.reshape(2, MODES, *REST.shape)
+        shapes = np.linalg.qr(random.normal(size=(REST.numel(), 2 * MODES)))[0].T.reshape(
+            2, MODES, *REST.shape
+        )
         self.shapes = torch.tensor(shapes) * torch.tensor([1e-2, 1.0])[:, None, None, None]
-        self.matrix = torch.tensor(0.98 * np.linalg.qr(random.normal(size=(2 * MODES, 2 * MODES)))[0])
+        self.matrix = torch.tensor(
+            0.98 * np.linalg.qr(random.normal(size=(2 * MODES, 2 * MODES)))[0]
+        )
 
     def state(self, z):
         """(S, N, 3) positions and velocities of (S, 2 MODES) coordinates."""
@@ -45,7 +60,9 @@ class LinearSystem:
         return REST + u, v
 
     def samples(self, seed=1):
-        z = torch.randn(SAMPLES, 2 * MODES, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        z = torch.randn(
+            SAMPLES, 2 * MODES, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+        )
         return z - z.mean(0), (z - z.mean(0)) @ self.matrix.mT
 
 
@@ -59,7 +76,9 @@ def linear_model(system, kind):
     torch.manual_seed(0)
     now, following = (system.state(z) for z in system.samples())
     model = build_model(NextState, NETWORKS[kind], REST, *now)
-    model.fit_linear(model.encode(*now), model.encode_outputs(following[0] - REST, following[1]), 1e-6)
+    model.fit_linear(
+        model.encode(*now), model.encode_outputs(following[0] - REST, following[1]), 1e-6
+    )
     model.remainder.zero_()
     return model.eval()
 
@@ -67,14 +86,18 @@ def linear_model(system, kind):
 @pytest.mark.parametrize("kind", NETWORKS)
 def test_the_linear_part_alone_reproduces_a_linear_system(system, kind):
     model = linear_model(system, kind)
-    z = torch.tensor([[1.0, -2.0, 0.5, 0.0, 1.5, -1.0], [0.0, 0.3, 0.0, -2.0, 0.0, 0.7]], dtype=torch.float64)
+    z = torch.tensor(
+        [[1.0, -2.0, 0.5, 0.0, 1.5, -1.0], [0.0, 0.3, 0.0, -2.0, 0.0, 0.7]], dtype=torch.float64
+    )
     start = State(*system.state(z))
     step = correction.CorrectedSimulator(SIMULATOR, correction.LearnedPredictor(model)).step
     with torch.no_grad():
         positions = torch.stack(rollout(step, start, range(30), correction.known_positions), 1)
     for step in range(31):
         q, _ = system.state(z @ torch.linalg.matrix_power(system.matrix, step).mT)
-        torch.testing.assert_close(positions[:, step], q, rtol=0.0, atol=1e-5 * float((start.q - REST).abs().max()))
+        torch.testing.assert_close(
+            positions[:, step], q, rtol=0.0, atol=1e-5 * float((start.q - REST).abs().max())
+        )
 
 
 @pytest.mark.parametrize(
@@ -86,7 +109,9 @@ def test_the_linear_part_alone_reproduces_a_linear_system(system, kind):
     ],
 )
 def test_a_diverged_roll_out_stays_lost_and_does_not_affect_others(value, left):
-    """The second of three environments leaves at its third step, and would come back if it was asked."""
+    """The second of three environments leaves at its third step,
+    and would come back if it was asked.
+    """
     calls = []
 
     def predict(state, step):
@@ -111,18 +136,25 @@ def test_a_diverged_roll_out_stays_lost_and_does_not_affect_others(value, left):
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
 def test_lost_environments_stand_at_rest_without_inputs(integrator):
     settings = SolverSettings(on_failure="count", max_iterations=15)
-    simulator = Simulator(BODY, Corotated(2e4, 0.3, prony=[(0.5, 0.1)]), integrator=integrator, solver=settings)
+    simulator = Simulator(
+        BODY, Corotated(2e4, 0.3, prony=[(0.5, 0.1)]), integrator=integrator, solver=settings
+    )
 
     def predict(state, step):
         force = torch.zeros_like(state.q)
         force[1] = torch.nan if step == 2 else 0.0
         if step == 3:  # which the solver cannot follow
-            force[2] = 1e3 * torch.randn(force[2].shape, generator=torch.Generator().manual_seed(0), dtype=force.dtype)
+            force[2] = 1e3 * torch.randn(
+                force[2].shape, generator=torch.Generator().manual_seed(0), dtype=force.dtype
+            )
         return force
 
     state, other = (
         rollout(
-            correction.CorrectedSimulator(simulator, force).step, simulator.rest_state(3), range(5), lambda now: now
+            correction.CorrectedSimulator(simulator, force).step,
+            simulator.rest_state(3),
+            range(5),
+            lambda now: now,
         )[-1]
         for force in (predict, None)
     )
@@ -142,7 +174,9 @@ def travels(predict, steps=30):
     share = share**2 * (3.0 - 2.0 * share)
     turn = rotations(share * torch.tensor([0.0, 3.0, 0.0]))
     away = REST[BODY.fixed_vertices] @ turn.mT + (share * torch.tensor([3.0, 0.0, 0.0]))[:, None]
-    inputs = Inputs(fixed_positions=torch.stack([REST[BODY.fixed_vertices].expand_as(away), away], 1))
+    inputs = Inputs(
+        fixed_positions=torch.stack([REST[BODY.fixed_vertices].expand_as(away), away], 1)
+    )
     step = correction.CorrectedSimulator(simulator, predict, inputs).step
     with torch.no_grad():
         return rollout(step, simulator.rest_state(2), range(steps), lambda now: now), turn[-1]
@@ -159,7 +193,9 @@ def test_a_lost_environment_stands_at_rest_on_its_own_base():
     assert motion[20].lost.tolist() == [False, False]
     assert motion[-1].lost.tolist() == [True, True]
     np.testing.assert_allclose(motion[-1].q[0], REST, atol=1e-9)
-    np.testing.assert_allclose(motion[-1].q[1], REST @ turn.mT + torch.tensor([3.0, 0.0, 0.0]), atol=1e-8)
+    np.testing.assert_allclose(
+        motion[-1].q[1], REST @ turn.mT + torch.tensor([3.0, 0.0, 0.0]), atol=1e-8
+    )
     assert not motion[-1].v.any()
 
 
@@ -177,8 +213,12 @@ def test_a_free_body_flies_as_far_as_it_likes_in_one_piece(apart, lost):
 
 
 def at_rest(*stiffnesses):
-    """The state of beams with springs (N/m) from their tips to the places of their tips at rest, and the force."""
-    s = Simulator(BODY, Corotated(1e5, 0.4), solver=SolverSettings(name="newton", relative_tolerance=1e-12))
+    """The state of beams with springs (N/m) from their tips to the places of their tips
+    at rest, and the force.
+    """
+    s = Simulator(
+        BODY, Corotated(1e5, 0.4), solver=SolverSettings(name="newton", relative_tolerance=1e-12)
+    )
     k = torch.zeros(len(stiffnesses), len(MESH.vertices), 1, dtype=torch.float64)
     k[:, TIP] = torch.tensor(stiffnesses, dtype=torch.float64)[:, None, None]
 
@@ -230,7 +270,9 @@ def test_a_clamp_carries_the_weight_alone_under_a_force_within_the_body():
 
 
 def test_an_equilibrium_is_found_where_its_iteration_would_grow_and_has_gradients():
-    """A spring at the tip, 40 times as stiff as the beam: each equilibrium overshoots the one before."""
+    """A spring at the tip, 40 times as stiff as the beam:
+    each equilibrium overshoots the one before.
+    """
     s, *_ = at_rest(0.0)
 
     def tip(values):
@@ -243,7 +285,10 @@ def test_an_equilibrium_is_found_where_its_iteration_would_grow_and_has_gradient
         at = equilibrium_under_feedback(s, Inputs(), constants, s.rest_state(), force)
         return at.q[:, TIP, 2].mean() * 1e3 + at.reaction.moment().square().sum()
 
-    values = {"stiffness": torch.tensor(100.0).double(), "youngs_modulus": torch.tensor([[1e5]]).double()}
+    values = {
+        "stiffness": torch.tensor(100.0).double(),
+        "youngs_modulus": torch.tensor([[1e5]]).double(),
+    }
     check_slopes(tip, values, {"stiffness": 3.0, "youngs_modulus": 3e3}, tolerance=1e-4)
 
 
@@ -254,7 +299,9 @@ def test_an_equilibrium_under_a_force_that_is_the_same_everywhere_has_gradients(
         force = torch.zeros_like(s.rest_state().q)
         force[:, TIP, 2] = values["push"]
         constants = s.prepare({"youngs_modulus": values["youngs_modulus"]})
-        at = equilibrium_under_feedback(s, Inputs(), constants, s.rest_state(), lambda state, number: force)
+        at = equilibrium_under_feedback(
+            s, Inputs(), constants, s.rest_state(), lambda state, number: force
+        )
         return 1e3 * at.q[:, TIP, 2].mean()
 
     values = {"push": torch.tensor(0.01).double(), "youngs_modulus": torch.tensor([[1e5]]).double()}
@@ -277,8 +324,20 @@ def test_a_force_that_turns_round_has_no_equilibrium():
 
 
 NETWORK = NetworkSettings(kind="nodal", blocks=2, layers=1, width=16, activation="normalised_elu")
-CONFIG = {"epochs": 6, "batch_size": 16, "learning_rate": 5e-3, "final_learning_rate": 1e-4, "gamma": 0.5}
-CONFIG |= {"step_epochs": 2, "weight_decay": 1e-5, "noise": 0.01, "linear_noise": 0.01, "rollout_every": 2}
+CONFIG = {
+    "epochs": 6,
+    "batch_size": 16,
+    "learning_rate": 5e-3,
+    "final_learning_rate": 1e-4,
+    "gamma": 0.5,
+}
+CONFIG |= {
+    "step_epochs": 2,
+    "weight_decay": 1e-5,
+    "noise": 0.01,
+    "linear_noise": 0.01,
+    "rollout_every": 2,
+}
 
 
 def samples(count, seed):
@@ -300,7 +359,12 @@ def rollout_error(model):
 def trainer(seed=0, error=rollout_error, **settings):
     torch.manual_seed(seed)
     model = build_model(
-        ResidualForce, NETWORK, torch.zeros(4, 3, dtype=torch.float64), TRAIN.q, TRAIN.v, TRAIN.outputs[0]
+        ResidualForce,
+        NETWORK,
+        torch.zeros(4, 3, dtype=torch.float64),
+        TRAIN.q,
+        TRAIN.v,
+        TRAIN.outputs[0],
     )
     return Trainer(model, TRAIN, VALIDATION, error, TrainerSettings(**{**CONFIG, **settings}), seed)
 
@@ -315,7 +379,9 @@ def same(a, b):
     return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
 
 
-@pytest.mark.parametrize(("after", "settings"), [(3, {}), (2, {"schedule": "step", "selection": "validation_loss"})])
+@pytest.mark.parametrize(
+    ("after", "settings"), [(3, {}), (2, {"schedule": "step", "selection": "validation_loss"})]
+)
 def test_a_snapshot_goes_on_exactly(after, settings, tmp_path):
     whole = finish(trainer(**settings))
     first = trainer(**settings)
@@ -336,7 +402,8 @@ def test_a_snapshot_goes_on_exactly(after, settings, tmp_path):
 
 class TestSelection:
     @pytest.mark.parametrize(
-        ("errors", "best"), [([math.inf, 5.0, math.inf], 1), ([2.0, 2.0, 2.0], 0), ([math.inf, 4.0, 3.0], 2)]
+        ("errors", "best"),
+        [([math.inf, 5.0, math.inf], 1), ([2.0, 2.0, 2.0], 0), ([math.inf, 4.0, 3.0], 2)],
     )
     def test_the_smallest_roll_out_error_is_selected(self, errors, best):
         queue, weights = list(errors), []
@@ -356,7 +423,9 @@ class TestSelection:
     @pytest.mark.parametrize("measured", [3.0, math.inf])
     def test_the_smallest_validation_loss_is_selected(self, monkeypatch, measured):
         losses, weights, asked = [5.0, 4.0, 2.0, 3.0, math.nan, 6.0], [], []
-        run = trainer(selection="validation_loss", error=lambda model: asked.append(model) or measured)
+        run = trainer(
+            selection="validation_loss", error=lambda model: asked.append(model) or measured
+        )
         training = run._loss
 
         def loss(*samples):
@@ -408,17 +477,32 @@ def test_empty_split(name):
     splits = {"training": TRAIN, "validation": VALIDATION, name: replace(empty)}
     model = trainer().model
     with pytest.raises(InputError, match=f"the {name} split is empty"):
-        Trainer(model, splits["training"], splits["validation"], rollout_error, TrainerSettings(**CONFIG), 0)
+        Trainer(
+            model,
+            splits["training"],
+            splits["validation"],
+            rollout_error,
+            TrainerSettings(**CONFIG),
+            0,
+        )
 
 
 @pytest.mark.parametrize(("exponent", "smallest"), [(0.0, 1.0), (1.0, 0.1)])
 def test_outputs_are_weighted_by_their_deviation(exponent, smallest):
-    """With the power one, the validation loss is the squared error of the forces themselves, in units of theirs."""
+    """With the power one, the validation loss is the squared error
+    of the forces themselves, in units of theirs.
+    """
     forces = TRAIN.outputs[0] * torch.tensor([1.0, 1.0, 1.0, 0.1])[:, None]
     torch.manual_seed(0)
-    model = build_model(ResidualForce, NETWORK, torch.zeros(4, 3, dtype=torch.float64), TRAIN.q, TRAIN.v, forces)
-    data = [replace(samples, outputs=(forces[: len(samples.q)],)) for samples in (TRAIN, VALIDATION)]
-    run = Trainer(model, *data, rollout_error, TrainerSettings(**{**CONFIG, "scale_weight": exponent}), 0)
+    model = build_model(
+        ResidualForce, NETWORK, torch.zeros(4, 3, dtype=torch.float64), TRAIN.q, TRAIN.v, forces
+    )
+    data = [
+        replace(samples, outputs=(forces[: len(samples.q)],)) for samples in (TRAIN, VALIDATION)
+    ]
+    run = Trainer(
+        model, *data, rollout_error, TrainerSettings(**{**CONFIG, "scale_weight": exponent}), 0
+    )
     loss = run.run_epoch()["validation_loss"]
     (coder,) = model.coders
     with torch.no_grad():
@@ -426,4 +510,6 @@ def test_outputs_are_weighted_by_their_deviation(exponent, smallest):
     weighed = error.flatten(1) if exponent else error.flatten(1) / coder.scale
     unit = coder.scale.square().mean() if exponent else 1.0
     assert loss == pytest.approx(float(weighed.square().mean() / unit), rel=1e-4)
-    assert float(coder.scale.min() / coder.scale.max()) ** exponent == pytest.approx(smallest, rel=0.5)
+    assert float(coder.scale.min() / coder.scale.max()) ** exponent == pytest.approx(
+        smallest, rel=0.5
+    )

@@ -1,4 +1,6 @@
-"""Identification from sparse, noisy markers, and its uncertainty against least squares and correlated errors."""
+"""Identification from sparse, noisy markers, and its uncertainty against least squares
+and correlated errors.
+"""
 
 from dataclasses import replace
 
@@ -9,11 +11,27 @@ import torch
 from support.refusals import refuses
 from support.slopes import differences
 from support.swinging_beam import MARKERS, MESH, TIP, blank, double, simulated
-from warp_resphys import Body, ConvergenceError, InputError, Inputs, Simulator, SolverSettings, select_vertices
+from warp_resphys import (
+    Body,
+    ConvergenceError,
+    InputError,
+    Inputs,
+    Simulator,
+    SolverSettings,
+    select_vertices,
+)
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.learning.identification.misfit import Misfit
-from warp_resphys.learning.identification.search import Identification, first_points, search_parameters
-from warp_resphys.learning.identification.uncertainty import LinearMisfit, LinearTrial, uncertainty_of
+from warp_resphys.learning.identification.search import (
+    Identification,
+    first_points,
+    search_parameters,
+)
+from warp_resphys.learning.identification.uncertainty import (
+    LinearMisfit,
+    LinearTrial,
+    uncertainty_of,
+)
 from warp_resphys.learning.metrics import redundancy
 from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay
@@ -29,17 +47,24 @@ FIRST = {"youngs_modulus": 400e3, "stiffness_damping": 0.0}
 
 
 def simulator(kind=Simulator, **options):
-    return kind(Body(MESH, select_vertices(MESH, x=0.0)), time_step=0.01, integrator="bdf2", **options)
+    return kind(
+        Body(MESH, select_vertices(MESH, x=0.0)), time_step=0.01, integrator="bdf2", **options
+    )
 
 
 def replay_of(sim, truth, masses=(0.0, 0.05), frames=25, noise=0.0):
     """Motions from rest under gravity with the true parameters, and their beginning."""
     release = Start(sim.rest_state(len(masses)), torch.zeros(len(masses), dtype=torch.float64))
-    return simulated(Replay(sim, MARKERS, blank(frames, masses)), release, truth, noise=noise), release
+    return simulated(
+        Replay(sim, MARKERS, blank(frames, masses)), release, truth, noise=noise
+    ), release
 
 
 def test_stiffness_and_density_of_a_body_without_weights_are_correlated():
-    bounds = {"youngs_modulus": Bounds(lower=1e5, upper=1e6), "density": Bounds(lower=800.0, upper=1500.0)}
+    bounds = {
+        "youngs_modulus": Bounds(lower=1e5, upper=1e6),
+        "density": Bounds(lower=800.0, upper=1500.0),
+    }
     truth = {"youngs_modulus": 215e3, "density": 1070.0}
     replay, release = replay_of(simulator(), truth, masses=(0.0,), noise=5e-5)
     misfit = Misfit([(replay, release)], bounds)
@@ -58,7 +83,11 @@ def test_loss_and_derivatives_do_not_depend_on_the_number_of_threads(monkeypatch
         misfit = Misfit([pair], RANGES)
         results.append(misfit.linearise(misfit.to_unit(FIRST)))
     one, two = results
-    assert [trial.name for trial in two.trials] == [trial.name for trial in one.trials] == ["m0", "m1", "m2"]
+    assert (
+        [trial.name for trial in two.trials]
+        == [trial.name for trial in one.trials]
+        == ["m0", "m1", "m2"]
+    )
     assert two.loss == one.loss
     np.testing.assert_array_equal(two.gauss_newton, one.gauss_newton)
     np.testing.assert_array_equal(two.gradient, one.gradient)
@@ -110,7 +139,11 @@ def test_starts_are_the_first_guess_and_the_best_candidates():
     starts = first_points(misfit, FIRST, 3, 8, seed=0)
     assert len(starts) == 3
     assert starts[0] == pytest.approx(FIRST)
-    assert starts == first_points(misfit, FIRST, 3, 8, seed=0) != first_points(misfit, FIRST, 3, 8, seed=1)
+    assert (
+        starts
+        == first_points(misfit, FIRST, 3, 8, seed=0)
+        != first_points(misfit, FIRST, 3, 8, seed=1)
+    )
     assert abs(np.log(starts[1]["youngs_modulus"] / 215e3)) < 0.5
 
 
@@ -120,7 +153,10 @@ def test_identifications_of_other_versions_are_refused():
         ({"own": {"factor@bend": 1.1}}, "own"),
         ({"parameters": {"density": "x"}}, r"parameters\.density"),
     ):
-        with pytest.raises(DataFileError, match=f"^{key} is not of an identification of this version: identify again"):
+        with pytest.raises(
+            DataFileError,
+            match=f"^{key} is not of an identification of this version: identify again",
+        ):
             Identification.from_plain(plain)
 
 
@@ -138,7 +174,10 @@ def test_no_parameters_and_a_motion_that_stands_still_are_refused():
     [
         ({"lower": 1.0, "upper": 1.0}, "lower is 1: it must be below upper, 1"),
         ({"lower": 0.0, "upper": np.inf}, "upper is inf: it must be a number"),
-        ({"lower": 0.0, "upper": 1.0, "logarithmic": True}, "it must be positive, as the scale is logarithmic"),
+        (
+            {"lower": 0.0, "upper": 1.0, "logarithmic": True},
+            "it must be positive, as the scale is logarithmic",
+        ),
         (
             {"lower": 0.0, "upper": 1.0, "prior": Prior(mean=2.0, deviation=1.0)},
             "prior.mean is 2, outside of the range",
@@ -150,7 +189,9 @@ def test_bounds_leave_a_range_and_values_of_trials_have_a_prior(limits, sentence
     refuses(InputError, sentence, Bounds, **limits)
 
 
-@pytest.mark.parametrize("bounds", [Bounds(lower=1e5, upper=1e6, logarithmic=True), Bounds(lower=-1.0, upper=3.0)])
+@pytest.mark.parametrize(
+    "bounds", [Bounds(lower=1e5, upper=1e6, logarithmic=True), Bounds(lower=-1.0, upper=3.0)]
+)
 def test_bounds_there_and_back(bounds):
     unit = torch.linspace(0.0, 1.0, 5, dtype=torch.float64)
     values = bounds.from_unit(unit)
@@ -161,19 +202,24 @@ def test_bounds_there_and_back(bounds):
 
 def resting_pose(sim):
     """A pose under a weight with the true parameters, and its beginning."""
-    still, start = Replay(sim, MARKERS, blank(frames=1, masses=(0.1,))), Start.resting(sim.rest_positions[None])
+    still = Replay(sim, MARKERS, blank(frames=1, masses=(0.1,)))
+    start = Start.resting(sim.rest_positions[None])
     assert still.is_static
     return simulated(still, start, TRUTH), start
 
 
 def test_stiffness_and_damping_are_identified_from_poses_and_motions():
-    """A pose under a weight depends on the stiffness alone: the damping is identified from the motion."""
+    """A pose under a weight depends on the stiffness alone:
+    the damping is identified from the motion.
+    """
     motion, release = replay_of(simulator(), TRUTH, masses=(0.0,), frames=25)
     pose, start = resting_pose(motion.simulator)
     result = search_parameters(Misfit([(motion, release), (pose, start)], RANGES), [FIRST], 40)
     assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
     assert result.parameters["stiffness_damping"] == pytest.approx(0.002, rel=0.02)
-    alone = search_parameters(Misfit([(pose, start)], {"youngs_modulus": RANGES["youngs_modulus"]}), [FIRST], 40)
+    alone = search_parameters(
+        Misfit([(pose, start)], {"youngs_modulus": RANGES["youngs_modulus"]}), [FIRST], 40
+    )
     assert alone.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
 
 
@@ -183,7 +229,9 @@ ACCURACY = Accuracy(markers=0.003, shift=0.002)
 
 
 def late(observe=MARKERS, noise=1e-5):
-    """Motions from rest that a force at the tip causes, a little later than the inputs say, and their beginning."""
+    """Motions from rest that a force at the tip causes,
+    a little later than the inputs say, and their beginning.
+    """
     sim, count = simulator(), len(DELAYS)
     force = torch.zeros(FRAMES, count, len(MESH.vertices), 3, dtype=torch.float64)
     force[BEGIN:, :, TIP, 1] = 0.02  # N
@@ -199,10 +247,14 @@ def late(observe=MARKERS, noise=1e-5):
 def test_parameters_are_recovered_from_motions_whose_inputs_were_late(placed):
     """With markers that are elsewhere, too, whose places are held by a prior."""
     offsets = 2e-3 * double([[1.0, -0.5, 0.3], [-0.4, 0.6, 1.0], [0.2, 0.8, -1.0]])
-    askew = Placement(offsets, double([1e-3, 0.0, -1e-3]), double([0.0, 0.0, 0.0]), double([0.0, 0.0, 0.0]))
+    askew = Placement(
+        offsets, double([1e-3, 0.0, -1e-3]), double([0.0, 0.0, 0.0]), double([0.0, 0.0, 0.0])
+    )
     pair = late(PlacedMarkers.of(MARKERS, askew) if placed else MARKERS)
     more = {"accuracy": ACCURACY} if placed else {}
-    result = search_parameters(Misfit([pair], RANGES, delay=0.02, **more), [FIRST], 40, labels="abc")
+    result = search_parameters(
+        Misfit([pair], RANGES, delay=0.02, **more), [FIRST], 40, labels="abc"
+    )
     assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-2 if placed else 1e-3)
     assert result.parameters["stiffness_damping"] == pytest.approx(0.004, rel=0.05)
     on_time = search_parameters(Misfit([pair], RANGES, **more), [FIRST], 40, labels="abc")
@@ -213,8 +265,12 @@ def test_parameters_are_recovered_from_motions_whose_inputs_were_late(placed):
 def test_derivatives_are_those_of_the_loss_with_the_best_delays_and_priors(accuracy):
     replay, start = late(noise=1e-4)
     start = replace(start, delay=double([0.002, 0.0, 0.0]))
-    ranges = {**RANGES, "density": Bounds(lower=800.0, upper=1600.0, prior=Prior(mean=1100.0, deviation=50.0))}
-    misfit, unit = Misfit([(replay, start)], ranges, accuracy=accuracy, delay=0.02), np.array([0.4, 0.25, 0.9])
+    ranges = {
+        **RANGES,
+        "density": Bounds(lower=800.0, upper=1600.0, prior=Prior(mean=1100.0, deviation=50.0)),
+    }
+    misfit = Misfit([(replay, start)], ranges, accuracy=accuracy, delay=0.02)
+    unit = np.array([0.4, 0.25, 0.9])
     for _ in range(2):
         misfit.update_prior_weight(unit)
     linear = misfit.linearise(unit)
@@ -226,7 +282,10 @@ def test_derivatives_are_those_of_the_loss_with_the_best_delays_and_priors(accur
     assert step @ matrix @ step > 0.0
 
 
-BOUNDS = {"stiffness": Bounds(lower=1.0, upper=3.0), "damping": Bounds(lower=0.1, upper=10.0, logarithmic=True)}
+BOUNDS = {
+    "stiffness": Bounds(lower=1.0, upper=3.0),
+    "damping": Bounds(lower=0.1, upper=10.0, logarithmic=True),
+}
 UNIT = np.array([0.5, 0.25])
 
 
@@ -240,13 +299,18 @@ def series(correlation, shape, seed=0):
 
 def linear(rows, slopes):
     """One trial without priors."""
-    return LinearMisfit([LinearTrial(rows, slopes, rows.size)], np.zeros(0), np.zeros((0, slopes.shape[1])), 1.0)
+    return LinearMisfit(
+        [LinearTrial(rows, slopes, rows.size)], np.zeros(0), np.zeros((0, slopes.shape[1])), 1.0
+    )
 
 
 def test_independent_errors_have_the_covariance_of_least_squares():
     frames, coordinates = 400, 6
     rows = 0.1 * series(0.0, (frames, coordinates))
-    jacobian = np.random.default_rng(1).normal(size=(frames * coordinates, 2)) @ [[1.0, 0.6], [0.0, 0.5]]
+    jacobian = np.random.default_rng(1).normal(size=(frames * coordinates, 2)) @ [
+        [1.0, 0.6],
+        [0.0, 0.5],
+    ]
     result = uncertainty_of(linear(rows, jacobian), BOUNDS, UNIT)
     covariance = 0.1**2 * np.linalg.inv(jacobian.T @ jacobian)
     deviation = np.sqrt(np.diag(covariance))
@@ -260,7 +324,9 @@ def test_independent_errors_have_the_covariance_of_least_squares():
 
 @pytest.mark.parametrize("correlation", [0.5, 0.8])
 def test_correlated_frames_are_worth_fewer(correlation):
-    """The mean of an autoregressive series varies (1 + r) / (1 - r) times as much as that of independent values."""
+    """The mean of an autoregressive series varies (1 + r) / (1 - r) times
+    as much as that of independent values.
+    """
     rows = series(correlation, (4000, 5))
     expected = (1.0 + correlation) / (1.0 - correlation)
     assert redundancy(rows) == pytest.approx(expected, rel=0.15)
@@ -276,4 +342,6 @@ def test_what_the_data_do_not_change_is_uncertain_by_its_range():
     result = uncertainty_of(linear(rows, jacobian), BOUNDS, UNIT)
     assert result.poorest == {"stiffness": 0.0, "damping": 1.0}
     assert result.poorest_deviation == pytest.approx(12.0**-0.5)
-    assert result.deviation["damping"] == pytest.approx(12.0**-0.5 * 0.1 * 100**0.25 * np.log(100.0))
+    assert result.deviation["damping"] == pytest.approx(
+        12.0**-0.5 * 0.1 * 100**0.25 * np.log(100.0)
+    )

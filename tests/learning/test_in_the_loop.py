@@ -1,15 +1,30 @@
-"""Learning from markers: observations at the steps, errors of roll-outs, and training through the simulator."""
+"""Learning from markers: observations at the steps, errors of roll-outs,
+and training through the simulator.
+"""
 
 import numpy as np
 import pytest
 import torch
 
 from support.swinging_beam import double, simulated
-from warp_resphys import Body, ConvergenceError, Inputs, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys import (
+    Body,
+    ConvergenceError,
+    Inputs,
+    Simulator,
+    State,
+    box_hexahedra,
+    select_vertices,
+)
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.replay import Replay
-from warp_resphys.learning.residuals.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
+from warp_resphys.learning.residuals.in_the_loop import (
+    InTheLoop,
+    MotionLoss,
+    TrialGroup,
+    cross_validated_epochs,
+)
 from warp_resphys.learning.residuals.networks import ResidualForce, build_model
 from warp_resphys.learning.sensing import at_steps
 from warp_resphys.learning.start import Start
@@ -49,7 +64,11 @@ class TestAtSteps:
     def path(times):
         """(..., 2, 3) [m] a cubic, which a spline follows exactly."""
         t = torch.as_tensor(times, dtype=torch.float64)[..., None, None]
-        return torch.as_tensor(POINTS) + t**2 * torch.tensor([0.3, -0.1, 1.0]) + t**3 * torch.tensor([1.0, 2.0, -3.0])
+        return (
+            torch.as_tensor(POINTS)
+            + t**2 * torch.tensor([0.3, -0.1, 1.0])
+            + t**3 * torch.tensor([1.0, 2.0, -3.0])
+        )
 
     def seen(self, *hidden):
         markers = self.path(self.TIMES)[None].clone()
@@ -57,30 +76,45 @@ class TestAtSteps:
             markers[0, frames, marker] = torch.nan
         return motions_of(self.TIMES[None], markers)
 
-    def test_it_lasts_from_where_the_markers_were_held_to_the_last_frame_and_bridges_short_gaps(self):
+    def test_it_lasts_from_where_the_markers_were_held_to_the_last_frame_and_bridges_short_gaps(
+        self,
+    ):
         result = at_steps(self.seen(), STEP)
         assert result.shape == (1, 20, 2, 3)  # 0 to 0.19 s, the last frame at 0.193 s
         np.testing.assert_allclose(result[0], self.path(STEP * np.arange(20)), rtol=0, atol=1e-12)
         finer = at_steps(self.seen(), 0.5 * STEP)[0]
         np.testing.assert_allclose(finer, self.path(0.5 * STEP * np.arange(39)), rtol=0, atol=1e-12)
-        result = at_steps(self.seen((0, slice(5, 6)), (0, slice(10, 15)), (1, slice(2, None))), STEP)[0]
-        # Frames 9 and 15, at 0.093 and 0.153 s, are the last and first sight; 0.015 s around them count.
+        result = at_steps(
+            self.seen((0, slice(5, 6)), (0, slice(10, 15)), (1, slice(2, None))), STEP
+        )[0]
+        # Frames 9 and 15, at 0.093 and 0.153 s, are the last and first sight; 0.015 s around them
+        # count.
         lost = np.isnan(result[:, 0]).all(1)
         np.testing.assert_array_equal(np.flatnonzero(lost), [11, 12, 13])
-        np.testing.assert_allclose(result[~lost, 0], self.path(STEP * np.flatnonzero(~lost))[:, 0], rtol=0, atol=1e-12)
-        assert np.isnan(result[:, 1]).all()  # three sights with that at the release: too few for a cubic
+        np.testing.assert_allclose(
+            result[~lost, 0], self.path(STEP * np.flatnonzero(~lost))[:, 0], rtol=0, atol=1e-12
+        )
+        # Three sights with that at the release: too few for a cubic.
+        assert np.isnan(result[:, 1]).all()
         result = at_steps(self.seen(), STEP, delay=double([0.002]))[0]
-        np.testing.assert_allclose(result[2:], self.path(0.002 + STEP * np.arange(2, 20)), rtol=0, atol=1e-6)
+        np.testing.assert_allclose(
+            result[2:], self.path(0.002 + STEP * np.arange(2, 20)), rtol=0, atol=1e-6
+        )
 
 
 def observed_motions(frames=6):
-    """Two motions of the beam, bare and with a weight, that another stiffness made; and how they begin."""
+    """Two motions of the beam, bare and with a weight, that another stiffness made.
+
+    And how they begin.
+    """
     sim = simulator()
     times = (STEP * torch.arange(1, frames + 1, dtype=torch.float64)).repeat(2, 1)
     blank = motions_of(times, torch.as_tensor(POINTS).repeat(2, frames, 1, 1))
     rest = sim.rest_state(2)
     release = Start(State(rest.q, rest.v), torch.zeros(2, dtype=torch.float64))
-    return simulated(Replay(sim, MARKERS, blank), release, {"youngs_modulus": 180e3}).trials, release
+    return simulated(
+        Replay(sim, MARKERS, blank), release, {"youngs_modulus": 180e3}
+    ).trials, release
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +128,13 @@ def network(seed=0, **changes):
     rest = simulator().rest_positions
     q, v, force = (1e-2 * torch.randn(12, *rest.shape, dtype=torch.float64) for _ in range(3))
     return build_model(
-        ResidualForce, NETWORK.changed(**changes), rest, rest + q, v, force + 1e-2, LOADS.repeat(6, 1)
+        ResidualForce,
+        NETWORK.changed(**changes),
+        rest,
+        rest + q,
+        v,
+        force + 1e-2,
+        LOADS.repeat(6, 1),
     ).double()
 
 
@@ -143,7 +183,8 @@ class TestInTheLoop:
         trainer = finish(InTheLoop(network(), loss, loss, CONFIG.changed(epochs=12)))
         losses = [record["train_loss"] for record in trainer.history]
         assert losses == sorted(losses, reverse=True)
-        assert losses[-1] < 0.5 * losses[0]  # the way there hangs on rounding, from four epochs (0.53) to eight (0.42)
+        # The way there hangs on rounding, from four epochs (0.53) to eight (0.42).
+        assert losses[-1] < 0.5 * losses[0]
         errors = [record["rollout_error_mm"] for record in trainer.history]
         assert loss.error_mm(trainer.use_best()) == pytest.approx(min(errors), rel=1e-9)
 
@@ -168,7 +209,9 @@ class TestInTheLoop:
         assert loss.error_mm(None) == float("inf")
 
     def test_cross_validation_selects_the_number_of_epochs(self, loss):
-        """Here the held-out motions are those of training, there such as the simulator makes without a force."""
+        """Here the held-out motions are those of training,
+        there such as the simulator makes without a force.
+        """
         motions, release = observed_motions()
         exact = simulated(Replay(simulator(), MARKERS, motions), release)
         other = MotionLoss([TrialGroup(exact, release, LOADS)], {})
@@ -177,7 +220,9 @@ class TestInTheLoop:
         epochs, (before, after) = cross_validated_epochs([trainer], lambda: seen.append(1))
         assert epochs == 3
         assert len(before) == len(after) == len(motions.names)
-        assert np.mean([row.mean() for row in before]) == pytest.approx(loss.error_mm(None), rel=1e-9)
+        assert np.mean([row.mean() for row in before]) == pytest.approx(
+            loss.error_mm(None), rel=1e-9
+        )
         assert np.mean([row.mean() for row in after]) < np.mean([row.mean() for row in before])
         assert len(seen) == 3
         for patience, spent in ((2, 2), (9, 3)):
@@ -192,7 +237,8 @@ class TestInTheLoop:
             histories.append([record["rollout_error_mm"] for record in alone.history])
         parts = [InTheLoop(network(), loss, held_out, config) for held_out in (loss, loss, other)]
         mean = np.average(histories, axis=0, weights=[2, 1])
-        assert 0 < np.argmin(mean) == cross_validated_epochs(parts, lambda: None)[0]  # The mean decides.
+        # The mean decides.
+        assert 0 < np.argmin(mean) == cross_validated_epochs(parts, lambda: None)[0]
         trainer = InTheLoop(network(), loss, loss, config, epochs=0)
         trainer.begin()
         assert trainer.finished

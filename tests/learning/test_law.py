@@ -1,4 +1,6 @@
-"""Laws: the balance of forces gives their coefficients, and those identified from motions have scores on trials."""
+"""Laws: the balance of forces gives their coefficients,
+and those identified from motions have scores on trials.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,7 +12,16 @@ import torch
 
 from support import regions
 from support.refusals import refuses
-from warp_resphys import Body, InputError, Inputs, Simulator, SolverSettings, box_hexahedra, evaluate, select_vertices
+from warp_resphys import (
+    Body,
+    InputError,
+    Inputs,
+    Simulator,
+    SolverSettings,
+    box_hexahedra,
+    evaluate,
+    select_vertices,
+)
 from warp_resphys.energies import make_material
 from warp_resphys.energies.catalogue import unit_of
 from warp_resphys.energies.materials import Corotated
@@ -83,7 +94,9 @@ def residual_of(forces, target):
 def fit(columns, target):
     """Coefficients of all columns, and their residual."""
     coefficients = NormalEquations.of(columns, target).fit(range(columns.shape[1]))
-    return SimpleNamespace(coefficients=coefficients, residual=residual_of(columns @ coefficients, target))
+    return SimpleNamespace(
+        coefficients=coefficients, residual=residual_of(columns @ coefficients, target)
+    )
 
 
 def unknown(integrator="implicit_euler"):
@@ -99,14 +112,18 @@ def balance(request):
 
 def test_known_coefficients_are_recovered_and_terms_that_the_law_does_not_have_get_none(balance):
     columns = balance.columns(CANDIDATES)
-    assert columns.shape == (6 * 2 * 16 * 3, len(UNIT))  # steps, motions, free vertices, coordinates
+    # Steps, motions, free vertices, coordinates.
+    assert columns.shape == (6 * 2 * 16 * 3, len(UNIT))
     found = fit(columns, balance.target)
     np.testing.assert_allclose(found.coefficients, TRUE, rtol=1e-4)
     assert found.residual < 1e-7
     assert residual_of(columns @ (1.1 * TRUE), balance.target) == pytest.approx(0.1, rel=1e-3)
     without = fit(balance.columns([*CANDIDATES[:3], *CANDIDATES[4:]]), balance.target)
     others = {"c01": 1e5, "c02": 1e5, "dilation": 1e5, "fibre_stiffening_1": 1e5}
-    found = fit(balance.columns([*CANDIDATES, *({name: unit} for name, unit in others.items())]), balance.target)
+    found = fit(
+        balance.columns([*CANDIDATES, *({name: unit} for name, unit in others.items())]),
+        balance.target,
+    )
     np.testing.assert_allclose(found.coefficients[len(UNIT) :], 0.0, atol=1e-3)
     np.testing.assert_allclose(found.coefficients[: len(UNIT)], TRUE, rtol=0.02)
     assert without.residual > 1e4 * found.residual
@@ -116,7 +133,9 @@ def test_loads_during_the_motion_and_steps_between_two_rows_are_part_of_the_bala
     """Rows of a larger stride are among those of every step."""
     sim = simulator(TRUE)
     motion = released(sim, PULLS[:1])
-    fine, coarse = (WeakForm(unknown(), [motion], SHAPE, STIFF, stride).columns(CANDIDATES) for stride in (1, 4))
+    fine, coarse = (
+        WeakForm(unknown(), [motion], SHAPE, STIFF, stride).columns(CANDIDATES) for stride in (1, 4)
+    )
     rows = fine.reshape(12, -1, len(UNIT))[::4].reshape(-1, len(UNIT))
     np.testing.assert_allclose(coarse, rows, rtol=0.0, atol=1e-12 * np.abs(rows).max())
     assert np.abs(fine[:, 5]).max() > 0.0
@@ -141,14 +160,20 @@ def test_a_fit_has_no_negative_coefficient():
     least = np.linalg.lstsq(columns[:, [0, 2]], columns @ true, rcond=None)[0]
     np.testing.assert_allclose(found.coefficients[[0, 2]], least, rtol=1e-6)
     equations = NormalEquations.of(columns, columns @ true)
-    assert equations.residual(range(4), found.coefficients) == pytest.approx(found.residual, rel=1e-6)
+    assert equations.residual(range(4), found.coefficients) == pytest.approx(
+        found.residual, rel=1e-6
+    )
 
 
 @pytest.mark.parametrize(("motions", "stride"), [(0, 5), (1, 0)])
 def test_nothing_to_balance_is_refused(motions, stride):
     sim = simulator(TRUE)
-    still = KnownMotion(sim.rest_positions.expand(3, 1, -1, -1), torch.zeros_like(sim.rest_positions)[None])
-    refuses(InputError, "no step to balance", WeakForm, sim, [still] * motions, SHAPE, STIFF, stride)
+    still = KnownMotion(
+        sim.rest_positions.expand(3, 1, -1, -1), torch.zeros_like(sim.rest_positions)[None]
+    )
+    refuses(
+        InputError, "no step to balance", WeakForm, sim, [still] * motions, SHAPE, STIFF, stride
+    )
 
 
 TERMS, TIMES = ("c20", "c01", "ogden_4"), np.geomspace(0.01, 0.2, 8).tolist()
@@ -162,7 +187,9 @@ def classes(truth):
     zero = dict.fromkeys((*TERMS, "c10", "bulk_1", "shear_viscosity", "prony_modulus_1"), 0.0)
     shape = {"prony_time_1": 0.05}
     unknown, true = beam({**zero, **shape}), beam(truth)
-    forms = [WeakForm(unknown, [released(true, pulls)], shape, STIFF, 3) for pulls in (WIDE, HELD_OUT)]
+    forms = [
+        WeakForm(unknown, [released(true, pulls)], shape, STIFF, 3) for pulls in (WIDE, HELD_OUT)
+    ]
     laws = fit_classes(*forms, TERMS, TIMES, 0)
     sizes = [len(law.groups) for law in laws]
     assert sizes == sorted(sizes)
@@ -187,7 +214,10 @@ def test_a_branch_between_two_times_of_the_grid_and_neighbouring_times_are_one_b
     truth = {**NEO_HOOKEAN, "prony_modulus_1": 15e3, "prony_time_1": math.sqrt(TIMES[3] * TIMES[4])}
     laws = classes(truth)
     found = laws["branches",]
-    assert {name for name in found.parameters if name.startswith("prony")} == {"prony_modulus_1", "prony_time_1"}
+    assert {name for name in found.parameters if name.startswith("prony")} == {
+        "prony_modulus_1",
+        "prony_time_1",
+    }
     assert found.parameters["prony_time_1"] == pytest.approx(truth["prony_time_1"], rel=0.05)
     assert found.parameters["prony_modulus_1"] == pytest.approx(15e3, rel=0.05)
     assert found.residual < 0.01 * laws[()].residual
@@ -197,9 +227,17 @@ def test_a_branch_between_two_times_of_the_grid_and_neighbouring_times_are_one_b
     assert {name: found[name] for name in ("c10", "bulk_1", "shear_viscosity")} == pytest.approx(
         {"c10": 4e4, "bulk_1": 2e6, "shear_viscosity": 50.0}
     )
-    together = 0.01 ** (1 / 4) * 0.015 ** (3 / 4)  # the mean of the logarithms, weighted by the moduli
-    branches = {"prony_modulus_1": 4e4, "prony_time_1": together, "prony_modulus_2": 2e4, "prony_time_2": 0.1}
-    assert {name: value for name, value in found.items() if name.startswith("prony")} == pytest.approx(branches)
+    # The mean of the logarithms, weighted by the moduli.
+    together = 0.01 ** (1 / 4) * 0.015 ** (3 / 4)
+    branches = {
+        "prony_modulus_1": 4e4,
+        "prony_time_1": together,
+        "prony_modulus_2": 2e4,
+        "prony_time_2": 0.1,
+    }
+    assert {
+        name: value for name, value in found.items() if name.startswith("prony")
+    } == pytest.approx(branches)
 
 
 SHEAR = 100e3  # Pa
@@ -212,14 +250,17 @@ def frames(seed, scale=1.0, count=400):
 
 
 class TestScore:
-    def test_its_error_is_the_root_of_the_mean_of_the_trials_and_a_small_but_certain_gain_counts(self):
+    def test_its_error_is_the_root_of_the_mean_of_the_trials_and_a_small_but_certain_gain_counts(
+        self,
+    ):
         score = Score((np.array([1.0, 3.0]), np.array([6.0, 6.0, 6.0])))
         assert score.error == pytest.approx(2.0)
         assert Score((np.array([1.0, np.nan]),)).error == math.inf
         better, worse = Score(frames(0, 0.97)), Score(frames(1))
         assert better.beats(worse)
         assert not worse.beats(better)
-        less, trial = np.where(np.arange(400) < 200, 0.9, 1.07), frames(0)  # in one half of the time alone
+        # In one half of the time alone.
+        less, trial = np.where(np.arange(400) < 200, 0.9, 1.07), frames(0)
         better = Score(tuple(less * own for own in trial))
         assert better.error < Score(trial).error
         assert not better.beats(Score(trial))
@@ -238,7 +279,14 @@ class TestScore:
 
 
 def test_terms_branches_and_families_that_hardly_resist_are_left_out_and_the_others_numbered_anew():
-    law = {"c10": 0.0, "c01": 50e3, "ogden_3": 5.0, "bulk_1": 1e6, "shear_viscosity": 1e-3, "bulk_viscosity": 40.0}
+    law = {
+        "c10": 0.0,
+        "c01": 50e3,
+        "ogden_3": 5.0,
+        "bulk_1": 1e6,
+        "shear_viscosity": 1e-3,
+        "bulk_viscosity": 40.0,
+    }
     law |= branches_of([1.0, 2e4], [0.01, 0.5]) | {"fibre_tension_1": 3.0, "fibre_toe_1": 0.02}
     law |= {"fibre_tension_2": 5e4, "fibre_toe_2": 0.03, "fibre_azimuth_2": 0.0}
     names = strong_names(law, SHEAR)
@@ -272,33 +320,53 @@ class Refined:
 
 
 def search_from_markers(errors, guess=None, lost=()):
-    """Groups of the classes in the order of the search, the best last, and the parameters that each began with.
+    """Groups of the classes in the order of the search, the best last,
+    and the parameters that each began with.
 
-    Errors are those of the validation trials by group; a refinement finds the lost parameters to be zero.
+    Errors are those of the validation trials by group; a refinement finds the lost parameters to be
+    zero.
     """
     began = []
 
     def refine(law):
         began.append(dict(law.parameters))
-        kept = {name: value for name, value in law.parameters.items() if not name.startswith(tuple(lost))}
-        kept["c10"] = 0.0 if "elastic" in law.groups else law.parameters["c10"]  # as if other terms took its place
-        return Refined(LawClass(law.groups, kept, math.nan), Score((np.array([errors[law.groups] ** 2] * 2),)))
+        kept = {
+            name: value
+            for name, value in law.parameters.items()
+            if not name.startswith(tuple(lost))
+        }
+        # As if other terms took its place.
+        kept["c10"] = 0.0 if "elastic" in law.groups else law.parameters["c10"]
+        return Refined(
+            LawClass(law.groups, kept, math.nan), Score((np.array([errors[law.groups] ** 2] * 2),))
+        )
 
-    settings = LawSettings(relaxation_times=(0.01, 1.0), terms=("c01", "ogden_3"), branches=3, families=1)
-    mesh, guess = box_hexahedra((0.01, 0.2, 0.01), (1, 1, 1)), {"c10": 0.5 * SHEAR, "bulk_1": 60e3, **(guess or {})}
+    settings = LawSettings(
+        relaxation_times=(0.01, 1.0), terms=("c01", "ogden_3"), branches=3, families=1
+    )
+    mesh = box_hexahedra((0.01, 0.2, 0.01), (1, 1, 1))
+    guess = {"c10": 0.5 * SHEAR, "bulk_1": 60e3, **(guess or {})}
     return [own.law.groups for own in tried_without_states(refine, guess, settings, mesh)], began
 
 
 @pytest.mark.parametrize("viscosity", [60.0, 0.0])
 def test_a_law_is_identified_from_observed_motions_and_simulates_on(viscosity):
-    """A Mooney-Rivlin beam, of which all vertices are seen; the simulator has a linear material of another modulus."""
+    """A Mooney-Rivlin beam, of which all vertices are seen.
+
+    The simulator has a linear material of another modulus.
+    """
     mesh = box_hexahedra((0.08, 0.02, 0.02), (4, 1, 1))
     body, tip = Body(mesh, fixed=select_vertices(mesh, x=0.0)), select_vertices(mesh, x=0.08)
-    truth = {"c10": 15e3, "c01": 25e3, "bulk_1": 1e6, "shear_viscosity": viscosity, "density": 1070.0}
+    truth = {
+        "c10": 15e3,
+        "c01": 25e3,
+        "bulk_1": 1e6,
+        "shear_viscosity": viscosity,
+        "density": 1070.0,
+    }
     robot = Simulator(body, make_material("law", **truth), time_step=0.01)
-    pulls = torch.tensor(
-        [[0.2, 0.0, -0.1], [-0.15, 0.1, 0.0], [0.1, 0.0, 0.2], [0.1, 0.1, 0.1]], dtype=torch.float64
-    )  # N
+    newtons = [[0.2, 0.0, -0.1], [-0.15, 0.1, 0.0], [0.1, 0.0, 0.2], [0.1, 0.1, 0.1]]
+    pulls = torch.tensor(newtons, dtype=torch.float64)
     pull = torch.zeros(4, len(mesh.vertices), 3, dtype=torch.float64)
     pull[:, tip] = pulls[:, None] / len(tip)
     with torch.no_grad():
@@ -306,7 +374,13 @@ def test_a_law_is_identified_from_observed_motions_and_simulates_on(viscosity):
         motions = ObservedMotions.of(robot, robot.rollout(start, 30).q, start)
     simulator = Simulator(body, Corotated(150e3, 0.45, density=1070.0), time_step=0.01)
     settings = LawSettings(terms=["c01", "c20"], branches=0, families=0, trials=None)
-    law = identify_law(simulator, motions, train=motions.trials.names[:3], validation=["motion 3"], settings=settings)
+    law = identify_law(
+        simulator,
+        motions,
+        train=motions.trials.names[:3],
+        validation=["motion 3"],
+        settings=settings,
+    )
     assert law.accepted
     assert law.groups == (("elastic", "viscosity") if viscosity else ("elastic",))
     assert viscosity or not {*VISCOSITIES} & law.parameters.keys()  # as its class has none
@@ -345,7 +419,10 @@ class TestSearchFromMarkers:
         creep = branches_of([2e4], [0.5])
         errors = {WHOLE: 1.0, ("branches", "fibres"): 1.0, ("fibres",): 1.0, (): 1.0}
         classes, began = search_from_markers(errors, creep)
-        assert began[0]["prony_time_2"] == pytest.approx(0.01**0.75)  # the longer time is close to the known one
+        # The longer time is close to the known one.
+        assert began[0]["prony_time_2"] == pytest.approx(0.01**0.75)
         assert "prony_time_3" not in began[0]
         assert classes[-1] == ()
-        assert {name: value for name, value in began[-1].items() if name.startswith("prony")} == creep
+        assert {
+            name: value for name, value in began[-1].items() if name.startswith("prony")
+        } == creep

@@ -1,4 +1,6 @@
-"""Laws from tests of specimens: coefficients, machines, classes by what they predict, simulated specimens, refusals."""
+"""Laws from tests of specimens: coefficients, machines,
+classes by what they predict, simulated specimens, refusals.
+"""
 
 from dataclasses import replace
 
@@ -18,8 +20,12 @@ STRAINS = np.linspace(0.02, 1.0, 120)
 MADE_OF = {"density": 1070.0, "poissons_ratio": 0.4995}
 
 
-def measured(kind, strains=STRAINS, law=SILICONE, noise=0.01, zero=0.0, toe=0.0, compliance=0.0, **known):
-    """A test of a law by a machine with a zero [Pa], a toe and a compliance [1/Pa], and relative noise."""
+def measured(
+    kind, strains=STRAINS, law=SILICONE, noise=0.01, zero=0.0, toe=0.0, compliance=0.0, **known
+):
+    """A test of a law by a machine with a zero [Pa],
+    a toe and a compliance [1/Pa], and relative noise.
+    """
     exact = stress(kind, strains, law)
     noisy = exact * (1.0 + noise * np.random.default_rng(1).standard_normal(len(strains)))
     return MaterialTest(kind, strains + toe + compliance * exact, noisy + zero, **known)
@@ -46,9 +52,12 @@ def test_machine_with_unknown_zero_toe_and_compliance():
     machine = {"zero": -4e3, "toe": 0.01, "compliance": 0.3e-6}
     given = measured("tension", **machine)
     knowing = replace(given, zero=5e3, toe=0.02, compliance=0.5e-6)
-    law, without = (identify_from_tests({"a": test}, terms=("ogden_3",), **MADE_OF) for test in (knowing, given))
+    law, without = (
+        identify_from_tests({"a": test}, terms=("ogden_3",), **MADE_OF) for test in (knowing, given)
+    )
     modulus, naive, true = (
-        stress("tension", np.array([1.0]), one)[0] for one in (law.parameters, without.parameters, SILICONE)
+        stress("tension", np.array([1.0]), one)[0]
+        for one in (law.parameters, without.parameters, SILICONE)
     )
     assert modulus == pytest.approx(true, rel=0.04)
     assert abs(naive / true - 1.0) > 0.05
@@ -59,7 +68,12 @@ def test_machine_with_unknown_zero_toe_and_compliance():
 def test_smallest_class_that_predicts():
     plain = identify_from_tests({"a": measured("tension", law={"c10": 30e3})}, **MADE_OF)
     assert plain.groups == []
-    assert [tried["groups"] for tried in plain.classes] == [[], ["c01"], ["ogden_3"], ["c01", "ogden_3"]]
+    assert [tried["groups"] for tried in plain.classes] == [
+        [],
+        ["c01"],
+        ["ogden_3"],
+        ["c01", "ogden_3"],
+    ]
     stiffening = identify_from_tests({"a": measured("tension")}, **MADE_OF)
     assert stiffening.groups == ["ogden_3"]
     content = stiffening.content()
@@ -90,11 +104,18 @@ def test_branches_from_a_hold():
 
 
 def test_law_of_another_source_is_a_prior_and_gives_its_branches():
-    """A vague prior changes nothing, a sharp one rules; the stress of known branches is left to them."""
+    """A vague prior changes nothing, a sharp one rules.
+
+    The stress of known branches is left to them.
+    """
     seconds = np.linspace(0.0, 1.0, len(STRAINS))
     columns = stress_columns("tension", STRAINS, ("c10", "prony_0.5"), seconds)
-    test = MaterialTest("tension", STRAINS, 25e3 * columns["c10"] + 6e3 * columns["prony_0.5"], seconds)
-    other = law_content("law", {"c10": 28e3, "bulk_1": 1e7, "prony_modulus_1": 6e3, "prony_time_1": 0.5})
+    test = MaterialTest(
+        "tension", STRAINS, 25e3 * columns["c10"] + 6e3 * columns["prony_0.5"], seconds
+    )
+    other = law_content(
+        "law", {"c10": 28e3, "bulk_1": 1e7, "prony_modulus_1": 6e3, "prony_time_1": 0.5}
+    )
     vague, sharp = ({**other, "shear_deviation": deviation} for deviation in (1e6, 1.0))
     from_vague, from_sharp = (
         identify_from_tests({"a": test}, terms=(), known=law, **MADE_OF) for law in (vague, sharp)
@@ -106,13 +127,16 @@ def test_law_of_another_source_is_a_prior_and_gives_its_branches():
 
 
 def test_glued_ends_against_gent_and_lindley():
-    """Apparent modulus of a flat rubber cylinder in compression: E (1 + 2 S^2), S = radius / (2 height) (1959)."""
+    """Apparent modulus of a flat rubber cylinder in compression:
+    E (1 + 2 S^2), S = radius / (2 height) (1959).
+    """
     specimen = Specimen(0.0125, (0.029,))
     law = {"c10": 30e3, "bulk_1": bulk_of({"c10": 30e3}, 0.4999)}
     value, columns, slope = specimen.response("compression", np.array([0.005, 0.01]), law)
     shape = 0.029 / (4.0 * 0.0125)
     assert value[1] / 0.01 == pytest.approx(180e3 * (1.0 + 2.0 * shape**2), rel=0.06)
-    assert columns["c10"][1] == pytest.approx(value[1] / 30e3, rel=0.02)  # all of the stress, but for the volume
+    # All of the stress, but for the volume.
+    assert columns["c10"][1] == pytest.approx(value[1] / 30e3, rel=0.02)
     assert slope[1] == pytest.approx((value[1] - value[0]) / 0.005, rel=0.02)
 
 
@@ -129,23 +153,31 @@ def test_a_specimen_is_simulated_where_samples_count():
 
 
 def test_derivatives_of_a_simulated_specimen():
-    specimen, law = Specimen(0.004, (0.01, 0.01), cells=1), {"c10": 30e3, "ogden_3": 10e3, "bulk_1": 5e6}
+    specimen = Specimen(0.004, (0.01, 0.01), cells=1)
+    law = {"c10": 30e3, "ogden_3": 10e3, "bulk_1": 5e6}
     strains = np.array([0.1, 0.2, 0.3])
     for kind in ("tension", "compression", "shear"):
         _, columns, _ = specimen.response(kind, strains, law)
         for name in ("c10", "ogden_3"):
-            low, high = (specimen.response(kind, strains, {**law, name: f * law[name]})[0] for f in (0.99, 1.01))
+            low, high = (
+                specimen.response(kind, strains, {**law, name: f * law[name]})[0]
+                for f in (0.99, 1.01)
+            )
             np.testing.assert_allclose(columns[name], (high - low) / (0.02 * law[name]), rtol=1e-4)
 
 
 @pytest.mark.slow
 def test_indentation_against_hertz():
-    """A sphere of radius R in a half-space: F = 16/9 E sqrt(R) d^(3/2) for an incompressible material."""
+    """A sphere of radius R in a half-space: F = 16/9 E sqrt(R) d^(3/2)
+    for an incompressible material.
+    """
     specimen = Specimen(0.03, (0.06, 0.06), indenter=0.006)
     law = {"c10": 30e3, "bulk_1": bulk_of({"c10": 30e3}, 0.4995)}
     depth = np.array([0.0015, 0.002, 0.0024])
     value, _, _ = specimen.response("indentation", depth / 0.03, law)
-    np.testing.assert_allclose(value * specimen.area, 16.0 / 9.0 * 180e3 * 0.006**0.5 * depth**1.5, rtol=0.08)
+    np.testing.assert_allclose(
+        value * specimen.area, 16.0 / 9.0 * 180e3 * 0.006**0.5 * depth**1.5, rtol=0.08
+    )
 
 
 def test_refusals():
@@ -159,7 +191,14 @@ def test_refusals():
     refuses(InputError, "mostly negative", MaterialTest, "tension", x, -x)
     refuses(InputError, "strains from 0.1 to 1", MaterialTest, "compression", x, x)
     refuses(InputError, "not per cent", MaterialTest, "tension", 100.0 * x, x)
-    refuses(InputError, "terms has 'gent'", identify_from_tests, {"a": measured("tension")}, terms=("gent",), **MADE_OF)
+    refuses(
+        InputError,
+        "terms has 'gent'",
+        identify_from_tests,
+        {"a": measured("tension")},
+        terms=("gent",),
+        **MADE_OF,
+    )
     refuses(
         InputError,
         "poissons_ratio is 0.5",
@@ -182,7 +221,12 @@ def test_refusals():
     refuses(InputError, "give a positive length", Specimen, 0.0, (0.01, 0.01))
     refuses(InputError, "presses on a block", Specimen, 0.1, (0.01,), indenter=0.01)
     refuses(
-        InputError, "glued ends have", Specimen(0.1, (0.1, 0.1)).response, "biaxial", x, {"c10": 1.0, "bulk_1": 1.0}
+        InputError,
+        "glued ends have",
+        Specimen(0.1, (0.1, 0.1)).response,
+        "biaxial",
+        x,
+        {"c10": 1.0, "bulk_1": 1.0},
     )
 
 
@@ -198,24 +242,36 @@ def test_a_shipped_law_is_a_source(name):
 
 
 def test_history_outside_the_range_counts():
-    """Branches remember strains that do not count; without them the same samples give another law."""
+    """Branches remember strains that do not count.
+
+    Without them the same samples give another law.
+    """
     seconds = np.linspace(0.0, 12.0, 240)
     strain = np.interp(seconds, [0.0, 1.0, 6.0, 7.0, 12.0], [0.0, 1.0, 1.0, 0.2, 0.2])
     columns = stress_columns("tension", strain, ("c10", "prony_1.0"), seconds)
     exact = 25e3 * columns["c10"] + 15e3 * columns["prony_1.0"]
     options = {"times": (1.0,), "terms": (), **MADE_OF}
     late = seconds > 3.0
-    law = identify_from_tests({"a": MaterialTest("tension", strain, exact, seconds, counted=late)}, **options)
+    law = identify_from_tests(
+        {"a": MaterialTest("tension", strain, exact, seconds, counted=late)}, **options
+    )
     assert law.parameters["c10"] == pytest.approx(25e3, rel=1e-6)
     assert law.parameters["prony_modulus_1"] == pytest.approx(15e3, rel=1e-6)
     assert law.errors["a"] < 1e-9
-    cut = identify_from_tests({"a": MaterialTest("tension", strain[late], exact[late], seconds[late])}, **options)
+    cut = identify_from_tests(
+        {"a": MaterialTest("tension", strain[late], exact[late], seconds[late])}, **options
+    )
     assert cut.errors["a"] > 1e-3
 
 
 def test_exact_data_need_no_larger_class():
     for kind in ("tension", "shear"):
-        assert identify_from_tests({"a": measured(kind, law={"c10": 30e3}, noise=0.0)}, **MADE_OF).groups == []
+        assert (
+            identify_from_tests(
+                {"a": measured(kind, law={"c10": 30e3}, noise=0.0)}, **MADE_OF
+            ).groups
+            == []
+        )
 
 
 def test_deviations_are_those_of_repeated_tests():

@@ -1,4 +1,6 @@
-"""Inflated membranes: membrane theory, derivatives, a factor that is recovered, tables, and public measurements."""
+"""Inflated membranes: membrane theory, derivatives, a factor that is recovered,
+tables, and public measurements.
+"""
 
 from dataclasses import replace
 
@@ -18,15 +20,20 @@ RINGED = Membrane(radius=0.04, thickness=0.002, cap=0.015, force=4.0, rings=[(0.
 HEIGHTS = np.linspace(0.3, 0.6, 30)
 LAW = {"c10": 12e3, "c20": 99.0}
 KNOWN = {"model": "law", "parameters": {"density": 1070.0, "c10": 8e3, "c20": 66.0, "bulk_1": 8e6}}
-HEAD = "# thickness_mm,contact_radius_mm,ring1_radius_mm,ring1_width_mm,ring2_radius_mm,ring2_width_mm = "
+HEAD = (
+    "# "
+    "thickness_mm,contact_radius_mm,ring1_radius_mm,ring1_width_mm,ring2_radius_mm,ring2_width_mm "
+    "= "
+)
 COLUMNS = "height_mm,pressure_Pa,lifted_force_N"
 
 
 def height_of(membrane, pressure, modulus):
     """Height of the cap by membrane theory, of a neo-Hookean disc without rings.
 
-    Stationarity of 2 pi h int w(l1, r / s) s ds - p V + F z(cap) in the radius s of the undeformed disc: with the slope
-    phi of the meridian, 2 pi s h w1 sin phi + p pi r^2 = F, and d(s h w1 cos phi) / ds = h w2 + p r l1 sin phi.
+    Stationarity of 2 pi h int w(l1, r / s) s ds - p V + F z(cap) in the radius s of the undeformed
+    disc: with the slope phi of the meridian, 2 pi s h w1 sin phi + p pi r^2 = F, and d(s h w1 cos
+    phi) / ds = h w2 + p r l1 sin phi.
     """
     h, force = membrane.thickness, membrane.force
 
@@ -46,7 +53,9 @@ def height_of(membrane, pressure, modulus):
     levels = np.linspace(0.02, 2.0, 40) * modulus * h * membrane.cap
     misses = [shot(level)[0] - membrane.radius for level in levels]
     at = next(k for k in range(len(levels) - 1) if misses[k] < 0.0 < misses[k + 1])
-    return -shot(brentq(lambda level: shot(level)[0] - membrane.radius, levels[at], levels[at + 1]))[2]
+    return -shot(
+        brentq(lambda level: shot(level)[0] - membrane.radius, levels[at], levels[at + 1])
+    )[2]
 
 
 def test_a_disc_lifts_its_cap_as_a_membrane():
@@ -67,11 +76,16 @@ def ringed():
 def test_derivatives_of_the_pressure(ringed):
     value, by_law, by_height = ringed
     for name, step in (("c10", 12.0), ("c20", 4.0)):
-        ends = [RINGED.response(HEIGHTS, {**LAW, name: LAW[name] + sign * step})[0] for sign in (1.0, -1.0)]
+        ends = [
+            RINGED.response(HEIGHTS, {**LAW, name: LAW[name] + sign * step})[0]
+            for sign in (1.0, -1.0)
+        ]
         np.testing.assert_allclose((ends[0] - ends[1]) / (2.0 * step), by_law[name], rtol=2e-3)
         assert np.all(by_law[name] > 0.0)
     middle = 0.5 * (HEIGHTS[1:] + HEIGHTS[:-1])
-    np.testing.assert_allclose(np.diff(value) / np.diff(HEIGHTS), np.interp(middle, HEIGHTS, by_height), rtol=0.02)
+    np.testing.assert_allclose(
+        np.diff(value) / np.diff(HEIGHTS), np.interp(middle, HEIGHTS, by_height), rtol=0.02
+    )
 
 
 def test_stiff_rings_raise_the_pressure(ringed):
@@ -102,15 +116,24 @@ def test_a_law_is_scaled_to_a_tensile_test():
 
 def test_tables(tmp_path):
     path = tmp_path / "membrane.csv"
-    path.write_text(f"{HEAD}[2.0, 25.4, 49.0, 5.0, nan, nan]\n{COLUMNS}\n10.0,3000,14.7\n", encoding="utf-8")
+    path.write_text(
+        f"{HEAD}[2.0, 25.4, 49.0, 5.0, nan, nan]\n{COLUMNS}\n10.0,3000,14.7\n", encoding="utf-8"
+    )
     table = read_membrane(path)
     assert table.rings == ((pytest.approx(0.049), pytest.approx(0.005)),)
     assert (table.thickness, table.cap) == (pytest.approx(0.002), pytest.approx(0.0254))
-    assert (table.height[0], table.pressure[0], table.force[0]) == (pytest.approx(0.01), 3000.0, 14.7)
+    assert (table.height[0], table.pressure[0], table.force[0]) == (
+        pytest.approx(0.01),
+        3000.0,
+        14.7,
+    )
     for text, message in (
         ("", "line 1 has no thickness_mm"),
         (f"{HEAD}[2.0]\n{COLUMNS}\n", "line 1 has no contact_radius_mm"),
-        (f"{HEAD}[2, 25, nan, nan, nan, nan]\nheight_mm,pressure_Pa\n", "line 2 has no column lifted_force_N"),
+        (
+            f"{HEAD}[2, 25, nan, nan, nan, nan]\nheight_mm,pressure_Pa\n",
+            "line 2 has no column lifted_force_N",
+        ),
         (f"{HEAD}[2, 25, nan, nan, nan, nan]\n{COLUMNS}\n1,2,3\n1,x,3\n", "line 4: give a number"),
     ):
         path.write_text(text, encoding="utf-8")
@@ -118,20 +141,43 @@ def test_tables(tmp_path):
 
 
 def test_membranes_that_cannot_be():
-    refuses(InputError, "edges of the rings and clamp are at 15, 11, 17", replace, RINGED, rings=[(0.014, 0.003)])
+    refuses(
+        InputError,
+        "edges of the rings and clamp are at 15, 11, 17",
+        replace,
+        RINGED,
+        rings=[(0.014, 0.003)],
+    )
     refuses(InputError, "thickness of a membrane is -1", replace, RINGED, thickness=-1.0)
     strain = np.linspace(0.1, 0.5, 9)
-    refuses(InputError, "kind is 'tension'", MaterialTest, "tension", strain, strain, specimen=RINGED)
+    refuses(
+        InputError, "kind is 'tension'", MaterialTest, "tension", strain, strain, specimen=RINGED
+    )
     refuses(InputError, "kind is 'bulge'", MaterialTest, "bulge", strain, strain)
-    refuses(InputError, "heights of a membrane start at zero", RINGED.response, strain - 0.1, {"c10": 1e4})
+    refuses(
+        InputError,
+        "heights of a membrane start at zero",
+        RINGED.response,
+        strain - 0.1,
+        {"c10": 1e4},
+    )
     loose = MaterialTest("tension", strain, strain, zero=0.1)
-    refuses(InputError, "lift has an unknown machine", scale_to_tests, {"lift": loose}, KNOWN, density=1.0)
+    refuses(
+        InputError,
+        "lift has an unknown machine",
+        scale_to_tests,
+        {"lift": loose},
+        KNOWN,
+        density=1.0,
+    )
     refuses(InputError, "tests is empty", scale_to_tests, {}, KNOWN, density=1.0)
 
 
 @pytest.mark.slow
 def test_public_membranes(shared_data):
-    """A law from tension up to 400 %, scaled on the disc without rings, predicts three with rings at three loads."""
+    """A law from tension up to 400 %, scaled on the disc without rings,
+    predicts three with rings at three loads.
+    """
     folder = shared_data / "ecoflex_membranes"
     if not folder.is_dir():
         pytest.skip(f"there is no folder {folder} of public membranes")
@@ -153,5 +199,7 @@ def _tests_of(path):
     for force in np.unique(table.force):
         rows = (table.force == force) & (table.height >= 0.010) & (table.height <= 0.055)
         membrane = Membrane(0.07, table.thickness, table.cap, force, table.rings)
-        tests[force] = MaterialTest("bulge", table.height[rows] / 0.07, table.pressure[rows], specimen=membrane)
+        tests[force] = MaterialTest(
+            "bulge", table.height[rows] / 0.07, table.pressure[rows], specimen=membrane
+        )
     return tests

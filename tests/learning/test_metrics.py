@@ -1,4 +1,6 @@
-"""Errors of roll-outs against values computed by hand, and the coverage of prediction intervals with known errors."""
+"""Errors of roll-outs against values computed by hand,
+and the coverage of prediction intervals with known errors.
+"""
 
 import json
 from dataclasses import replace
@@ -15,7 +17,9 @@ from warp_resphys.learning.scores import held_out_test, text_of
 
 
 def two_vertices(*distances: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """A roll-out whose two vertices are off by the given distances [m] at each state, and its target."""
+    """A roll-out whose two vertices are off by the given distances [m]
+    at each state, and its target.
+    """
     target = np.random.default_rng(0).normal(size=(len(distances), 2, 3))
     directions = np.array([[0.6, 0.0, -0.8], [0.0, 1.0, 0.0]])  # Unit vectors.
     return target + np.asarray(distances)[:, :, None] * directions, target
@@ -24,7 +28,12 @@ def two_vertices(*distances: tuple[float, float]) -> tuple[np.ndarray, np.ndarra
 def test_summary_pools_steps_and_takes_the_deviation_of_the_vertex_means() -> None:
     # Per-step means 1, 2 | 3, 6: mean 3, population variance ((2^2 + 1^2 + 0 + 3^2) / 4) = 3.5.
     summary = metrics.summarise([np.array([1.0, 2.0]), np.array([3.0, 6.0])])
-    assert summary == {"mean": 3.0, "std": pytest.approx(np.sqrt(3.5)), "trajectories": 2, "diverged": 0}
+    assert summary == {
+        "mean": 3.0,
+        "std": pytest.approx(np.sqrt(3.5)),
+        "trajectories": 2,
+        "diverged": 0,
+    }
 
 
 @pytest.mark.parametrize("bad", [np.nan, 1e300])
@@ -35,7 +44,12 @@ def test_a_diverged_rollout_is_counted_and_leaves_no_mean(bad: float) -> None:
     errors = metrics.marker_errors(positions[1:], target[1:])
     assert errors[0] == pytest.approx(1.0)
     summary = metrics.summarise([good, errors])
-    assert (summary["mean"], summary["std"], summary["diverged"], summary["trajectories"]) == (None, None, 1, 2)
+    assert (summary["mean"], summary["std"], summary["diverged"], summary["trajectories"]) == (
+        None,
+        None,
+        1,
+        2,
+    )
     entries = metrics.summarise_trajectories(["a", "b"], {"resphys": [good, errors]})
     assert [entry["errors_mm"]["resphys"] for entry in entries] == [pytest.approx(1.0), None]
     json.dumps([summary, entries], allow_nan=False)
@@ -43,7 +57,10 @@ def test_a_diverged_rollout_is_counted_and_leaves_no_mean(bad: float) -> None:
 
 def test_trials_have_equal_weight() -> None:
     folds = [
-        {"resphys": metrics.summarise([np.array([1.0, 1.0, 1.0])]), "simfree": metrics.summarise([np.array([2.0])])},
+        {
+            "resphys": metrics.summarise([np.array([1.0, 1.0, 1.0])]),
+            "simfree": metrics.summarise([np.array([2.0])]),
+        },
         {
             "resphys": metrics.summarise([np.array([3.0]), np.array([5.0])]),
             "simfree": metrics.summarise([np.array([np.nan])]),
@@ -55,22 +72,41 @@ def test_trials_have_equal_weight() -> None:
     assert metrics.summarise([np.array([1.0, 1.0, 1.0]), np.array([3.0])])["mean"] == 2.0
     simulated, seen = 1e-3 * np.array([[1.0], [4.0]]) * np.ones((2, 3)), np.zeros((2, 3))
     seen[1, 1:] = np.nan
-    by_marker = metrics.errors_per_marker(*(x[..., None, None] * [1.0, 0.0, 0.0] for x in (simulated, seen)), ["tip"])
+    by_marker = metrics.errors_per_marker(
+        *(x[..., None, None] * [1.0, 0.0, 0.0] for x in (simulated, seen)), ["tip"]
+    )
     assert by_marker == {"tip": pytest.approx(2.5)}
-    assert metrics.summarise_folds(folds[:1])["resphys"] == {"mean": 1.0, "std": None, "trajectories": 1, "diverged": 0}
+    assert metrics.summarise_folds(folds[:1])["resphys"] == {
+        "mean": 1.0,
+        "std": None,
+        "trajectories": 1,
+        "diverged": 0,
+    }
 
 
 def test_a_paired_gain_is_that_of_the_means_with_the_spread_of_the_trials():
     result = metrics.paired_gain([2.0, 1.0, 3.0], [1.0, 0.5, 1.5])
-    assert result.share == result.lower == result.upper == pytest.approx(0.5)  # the same on each trial, however large
-    assert metrics.paired_gain([1.0], [1.2]) == (pytest.approx(-0.2), pytest.approx(-0.2), pytest.approx(-0.2), 1)
+    # The same on each trial, however large.
+    assert result.share == result.lower == result.upper == pytest.approx(0.5)
+    assert metrics.paired_gain([1.0], [1.2]) == (
+        pytest.approx(-0.2),
+        pytest.approx(-0.2),
+        pytest.approx(-0.2),
+        1,
+    )
     two = metrics.paired_gain([1.0, 1.0], [0.5, 0.9])
-    assert (two.share, two.lower, two.upper) == (pytest.approx(0.3), pytest.approx(0.1), pytest.approx(0.5))
+    assert (two.share, two.lower, two.upper) == (
+        pytest.approx(0.3),
+        pytest.approx(0.1),
+        pytest.approx(0.5),
+    )
 
 
 @pytest.mark.parametrize("count", [5, pytest.param(20, marks=pytest.mark.slow)])
 def test_intervals_of_gains_have_their_stated_coverage(count):
-    """Trials whose gains scatter by as much again as their mean: 85 to 95 % where 90 % are meant."""
+    """Trials whose gains scatter by as much again as their mean:
+    85 to 95 % where 90 % are meant.
+    """
     draw, inside = np.random.default_rng(3), 0
     for _ in range(300):
         before = draw.uniform(0.5, 2.0, count)
@@ -81,7 +117,8 @@ def test_intervals_of_gains_have_their_stated_coverage(count):
 
 def test_a_driven_trial_rises_holds_and_is_released():
     times = 0.25 * np.arange(12)
-    inputs = np.array([0.0, 1.0, 1.005, 1.0, 1.0, 2.0, 2.0, 2.0, 2.0, 0.5, 0.5, 0.5])  # noise is no change
+    # Noise is no change.
+    inputs = np.array([0.0, 1.0, 1.005, 1.0, 1.0, 2.0, 2.0, 2.0, 2.0, 0.5, 0.5, 0.5])
 
     def found(inputs, before=0.0):
         since = time_since_change(times[:, None], [inputs[:, None, None]])[:, 0]
@@ -94,7 +131,10 @@ def test_a_driven_trial_rises_holds_and_is_released():
 
 
 def test_published_numbers_are_those_of_the_same_experiment():
-    assert metrics.published_errors("sopra_extrapolation") is metrics.PUBLISHED_MM["sopra_extrapolation"]
+    assert (
+        metrics.published_errors("sopra_extrapolation")
+        is metrics.PUBLISHED_MM["sopra_extrapolation"]
+    )
     assert metrics.published_errors("sopra_overpressure") is metrics.PUBLISHED_MM["sopra"]
     assert metrics.published_errors("beam_real_repeated") is metrics.PUBLISHED_MM["beam_real"]
     assert metrics.published_errors("segment_real") == {}
@@ -107,14 +147,18 @@ def test_mean_distances_count_what_was_seen():
     markers = np.zeros((1, 4, 2, 3))
     markers[0, :, 0, 0], markers[0, :, 1, 2] = 0.001, 0.003
     markers[0, 2:, 0] = np.nan
-    np.testing.assert_allclose(metrics.mean_distance(markers, measured)[0], [2.0, 3.0, np.nan, np.inf])
+    np.testing.assert_allclose(
+        metrics.mean_distance(markers, measured)[0], [2.0, 3.0, np.nan, np.inf]
+    )
 
 
 def test_the_median_filter_is_one_of_a_second_and_leaves_out_what_is_not_known():
     values = np.random.default_rng(1).normal(size=(2, 300))
     smooth = metrics.median_filter(values, 0.01)
     for at in (0, 20, 50, 150, 299):  # half a second to both sides: 50 steps
-        np.testing.assert_allclose(smooth[:, at], np.median(values[:, max(0, at - 50) : at + 51], axis=1))
+        np.testing.assert_allclose(
+            smooth[:, at], np.median(values[:, max(0, at - 50) : at + 51], axis=1)
+        )
     step = (np.arange(300) >= 150).astype(float)
     np.testing.assert_array_equal(metrics.median_filter(step, 0.01), step)
     spike = np.zeros(300)
@@ -145,7 +189,9 @@ def transient(moved, since):
 
 
 def trials(count, seed, noise, frames=60):
-    """Swinging markers, and observed ones with slowly varying errors of a size ``noise(displacement, time)`` [m]."""
+    """Swinging markers, and observed ones with slowly varying errors of a size
+    ``noise(displacement, time)`` [m].
+    """
     draw = np.random.default_rng(seed)
     made = {}
     for number in range(count):
@@ -163,7 +209,9 @@ def trials(count, seed, noise, frames=60):
 
 def by_amplitude(intervals, some):
     """Coverage in the thirds of the displacements, from the smallest."""
-    moved = np.concatenate([np.linalg.norm(trial.simulated - REST, axis=-1).ravel() for trial in some.values()])
+    moved = np.concatenate(
+        [np.linalg.norm(trial.simulated - REST, axis=-1).ravel() for trial in some.values()]
+    )
     inside = np.concatenate([intervals.covered(trial, REST)[0] for trial in some.values()])
     return [part.mean() for part in np.array_split(inside[np.argsort(moved)], 3)]
 
@@ -177,7 +225,10 @@ def covered(intervals, some):
 def test_intervals_have_their_coverage_on_other_trials_of_any_amplitude(noise, count):
     """Mean coverage over many calibrations, with few or many trials."""
     seeds = range(30 if count == 3 else 12)  # few trials calibrate to more different intervals
-    made = [(Intervals.calibrated(trials(count, s, noise), REST), trials(20, 1000 + s, noise)) for s in seeds]
+    made = [
+        (Intervals.calibrated(trials(count, s, noise), REST), trials(20, 1000 + s, noise))
+        for s in seeds
+    ]
     results = [covered(*pair) for pair in made]
     assert 0.86 < np.mean([result["coverage"] for result in results]) < 0.96
     thirds = np.mean([by_amplitude(*pair) for pair in made], axis=0)
@@ -186,13 +237,16 @@ def test_intervals_have_their_coverage_on_other_trials_of_any_amplitude(noise, c
 
 
 def test_intervals_are_as_wide_as_the_errors_are_large():
-    """Intervals that grow with time hold 90 % of Gaussian errors, which lie within 1.64 deviations."""
+    """Intervals that grow with time hold 90 % of Gaussian errors,
+    which lie within 1.64 deviations.
+    """
     intervals = Intervals.calibrated(trials(30, 3, transient), REST)
     x = REST + np.array([0.02, 0.0, 0.0])
     for since in (0.05, 0.5, 3.0):
         expected = 1.64 * transient(0.02, since)
         np.testing.assert_allclose(intervals.half_widths(x, REST, since), expected, rtol=0.35)
-    assert (intervals.half_widths(x, REST) >= intervals.half_widths(x, REST, 0.05)).all()  # At an unknown time.
+    # At an unknown time.
+    assert (intervals.half_widths(x, REST) >= intervals.half_widths(x, REST, 0.05)).all()
     times = np.array([0.05, 3.0])
     series = intervals.half_widths(np.stack([x, x]), REST, times)
     assert series.shape == (2, 2)
@@ -221,7 +275,9 @@ def test_unseen_markers_have_no_influence_on_intervals_and_diverged_models_have_
         trial.observed[10:, 0] = np.nan
     some = Intervals.calibrated(made, REST)
     at = REST + 0.01
-    assert some.half_widths(at, REST, 1.0) == pytest.approx(whole.half_widths(at, REST, 1.0), rel=0.3)
+    assert some.half_widths(at, REST, 1.0) == pytest.approx(
+        whole.half_widths(at, REST, 1.0), rel=0.3
+    )
     made["0"].observed[:] = np.nan
     assert np.isfinite(covered(some, made)["coverage"])
     made = trials(4, 2, constant)
@@ -243,14 +299,18 @@ def test_the_time_since_a_change_is_not_reset_by_noise():
 
 
 def test_intervals_grow_with_the_uncertainty_of_the_parameters():
-    """Outside of the calibration trials, where the spread is a hundred times as large and the errors follow it."""
+    """Outside of the calibration trials, where the spread is a hundred times
+    as large and the errors follow it.
+    """
 
     def spread_out(count, seed, size):
         draw = np.random.default_rng(seed)
         made = {}
         for name, trial in trials(count, seed, constant).items():
             off = size * draw.normal() * np.ones((1, 2, 3))  # An error of a parameter lasts.
-            made[name] = replace(trial, observed=trial.observed + off, spread=np.full((60, 2), size**2))
+            made[name] = replace(
+                trial, observed=trial.observed + off, spread=np.full((60, 2), size**2)
+            )
         return made
 
     intervals = Intervals.calibrated(spread_out(20, 6, 1e-3), REST)
@@ -266,7 +326,9 @@ def test_intervals_grow_with_the_uncertainty_of_the_parameters():
 
 
 def test_intervals_grow_beyond_the_training_as_the_errors_of_its_largest_trial_do():
-    """A model lacks a tenth of what it moves beyond its training, which calibration within the training cannot show."""
+    """A model lacks a tenth of what it moves beyond its training,
+    which calibration within the training cannot show.
+    """
 
     def moved(size, reach, seed):
         along = np.linspace(0.0, size, 60)[:, None, None] * np.array([1.0, 0.0, 0.0])
@@ -280,13 +342,16 @@ def test_intervals_grow_beyond_the_training_as_the_errors_of_its_largest_trial_d
     tested, inside = {"x": moved(0.030, 0.015, 6)}, {"x": moved(0.012, 1.0, 7)}
     assert covered(within, tested)["coverage"] < 0.65
     assert covered(growing, tested)["coverage"] > 0.9
-    assert growing.growth == pytest.approx(6.31 * 0.1, rel=0.1)  # Student's quantile, as it is known from one trial
+    # Student's quantile, as it is known from one trial
+    assert growing.growth == pytest.approx(6.31 * 0.1, rel=0.1)
     assert covered(growing, inside) == covered(within, inside)
     assert Intervals.from_plain(growing.plain()) == growing
     exact = within.growing(moved(0.015, 1.0, 8), 0.010, 0.015, REST)
     assert exact.growth < 0.2 * growing.growth
-    assert within.growing(moved(0.0101, 1.0, 9), 0.010, 0.0101, REST).growth == 0.0  # 0.1 mm show nothing
-    unsure = Intervals(within.factor, (0.25e-6, 0.0, 0.0, 0.0, 0.0))  # what the scale contains does not count again
+    # 0.1 mm show nothing
+    assert within.growing(moved(0.0101, 1.0, 9), 0.010, 0.0101, REST).growth == 0.0
+    # What the scale contains does not count again.
+    unsure = Intervals(within.factor, (0.25e-6, 0.0, 0.0, 0.0, 0.0))
     assert unsure.growing(moved(0.015, 0.010, 5), 0.010, 0.015, REST).growth < 0.2 * growing.growth
 
 
@@ -302,7 +367,8 @@ class TestHeldOut:
 
     def test_a_gain_counts_if_it_is_larger_than_its_spread_over_the_trials(self):
         assert self.used([0.8, 0.7, 0.9], [1.0, 1.0, 1.0], [20.0] * 3)
-        assert not self.used([1.05] * 5 + [1.0], [1.0] * 5 + [2.0], [20.0] * 6)  # It gains on one trial alone.
+        # It gains on one trial alone.
+        assert not self.used([1.05] * 5 + [1.0], [1.0] * 5 + [2.0], [20.0] * 6)
         assert not self.used([0.9999], [1.0], [20.0])
         assert not self.used([1.0], [0.0], [20.0])
 
@@ -311,7 +377,9 @@ class TestHeldOut:
         assert self.used([0.1, 0.1], [0.9, 0.9], [20.0, np.nan])
 
     def test_trials_without_a_marker_are_refused(self):
-        with pytest.raises(InputError, match=r"none of the validation trials shows a marker: a; take others"):
+        with pytest.raises(
+            InputError, match=r"none of the validation trials shows a marker: a; take others"
+        ):
             held_out_test(["a"], "validation", [np.zeros(0)], [np.zeros(0)], [20.0])
 
     def test_what_diverged_is_not_used_and_said_to(self):
@@ -320,4 +388,6 @@ class TestHeldOut:
         assert text_of(lost).startswith(
             "on the validation trials (a) it diverges, and the simulator without it has 1 mm"
         )
-        assert held_out_test(["a"], "validation", [self.FRAMES], [np.full(1, np.nan)], [20.0])["used"]
+        assert held_out_test(["a"], "validation", [self.FRAMES], [np.full(1, np.nan)], [20.0])[
+            "used"
+        ]

@@ -8,18 +8,40 @@ import pytest
 import torch
 from torch import nn
 
-from warp_resphys import Body, Corotated, InputError, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys import (
+    Body,
+    Corotated,
+    InputError,
+    Simulator,
+    State,
+    box_hexahedra,
+    select_vertices,
+)
 from warp_resphys.dynamics import modes
 from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
-from warp_resphys.learning.residuals.coders import actuation_coder, displacement_coder, nodal_coder, pod_coder
+from warp_resphys.learning.residuals.coders import (
+    actuation_coder,
+    displacement_coder,
+    nodal_coder,
+    pod_coder,
+)
 from warp_resphys.learning.residuals.correction import Learned, LearnedPredictor, Range
-from warp_resphys.learning.residuals.networks import NextState, ResidualForce, SkipMLP, build_model, restore
+from warp_resphys.learning.residuals.networks import (
+    NextState,
+    ResidualForce,
+    SkipMLP,
+    build_model,
+    restore,
+)
 from warp_resphys.settings.learning import NetworkSettings
 
 REDUCED = {"kind": "reduced", "position_modes": 3, "velocity_modes": 4, "force_modes": 5}
 ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 16, "activation": "normalised_elu"}
-KINDS = {"reduced": NetworkSettings(**REDUCED, **ARCHITECTURE), "nodal": NetworkSettings(kind="nodal", **ARCHITECTURE)}
+KINDS = {
+    "reduced": NetworkSettings(**REDUCED, **ARCHITECTURE),
+    "nodal": NetworkSettings(kind="nodal", **ARCHITECTURE),
+}
 
 
 def field(samples, vertices=6, rank=None, seed=0):
@@ -65,7 +87,9 @@ class TestPOD:
 
     @pytest.mark.parametrize(("samples", "modes"), [(40, 19), (40, 0)])
     def test_modes_that_the_samples_do_not_have(self, samples, modes):
-        with pytest.raises(InputError, match=f"{modes} modes were asked for, but {samples} samples give 1 to"):
+        with pytest.raises(
+            InputError, match=f"{modes} modes were asked for, but {samples} samples give 1 to"
+        ):
             pod_coder(field(samples), modes)
 
 
@@ -83,7 +107,8 @@ class TestResidualForce:
     def test_linear_part_is_ridge_regression(self):
         model, *_ = built("reduced")
         random = np.random.default_rng(0)
-        x, y = random.normal(size=(30, 7)).astype(np.float32), random.normal(size=(30, 5)).astype(np.float32)
+        x = random.normal(size=(30, 7)).astype(np.float32)
+        y = random.normal(size=(30, 5)).astype(np.float32)
         noise = 0.3
         model.fit_linear(torch.tensor(x), torch.tensor(y), noise)
         # Least squares with rows that say: noise sqrt(S) times each weight is zero.
@@ -95,7 +120,9 @@ class TestResidualForce:
         inputs = torch.tensor(x)
         together = model.standardised(inputs)
         np.testing.assert_allclose(
-            together.detach(), inputs @ model.linear + model.remainder * model.network(inputs).detach(), rtol=1e-6
+            together.detach(),
+            inputs @ model.linear + model.remainder * model.network(inputs).detach(),
+            rtol=1e-6,
         )
 
     @pytest.mark.parametrize("kind", KINDS)
@@ -117,7 +144,8 @@ class TestResidualForce:
 
 
 class TestActuation:
-    LOADS = torch.tensor([[0.0, 0.0], [0.05, 0.0], [0.1, 0.0]], dtype=torch.float64).repeat(14, 1)[:40]
+    LOADS = torch.tensor([[0.0, 0.0], [0.05, 0.0], [0.1, 0.0]], dtype=torch.float64).repeat(14, 1)
+    LOADS = LOADS[:40]
 
     def built(self, kind=ResidualForce, coded="reduced"):
         torch.manual_seed(0)
@@ -138,14 +166,20 @@ class TestActuation:
     def test_saved_and_restored_it_predicts_the_same(self, tmp_path, kind, coded, double):
         model, q, v = self.built(kind, coded)
         model = (model.double() if double else model).eval()
-        write_checkpoint(tmp_path / "model.safetensors", "test", model.state_dict(), model.description())
+        write_checkpoint(
+            tmp_path / "model.safetensors", "test", model.state_dict(), model.description()
+        )
         again = restore(kind, *read_checkpoint(tmp_path / "model.safetensors", "test"))
         assert again.state_dict().keys() == model.state_dict().keys()
         assert not again.training
         with torch.no_grad():
-            for one, other in zip(model.predict(q, v, self.LOADS), again.predict(q, v, self.LOADS), strict=True):
+            for one, other in zip(
+                model.predict(q, v, self.LOADS), again.predict(q, v, self.LOADS), strict=True
+            ):
                 assert torch.equal(one, other)
-            assert not torch.equal(model.predict(q, v, self.LOADS)[0], model.predict(q, v, 2.0 * self.LOADS)[0])
+            assert not torch.equal(
+                model.predict(q, v, self.LOADS)[0], model.predict(q, v, 2.0 * self.LOADS)[0]
+            )
 
     @pytest.mark.parametrize("kind", [ResidualForce, NextState])
     def test_inputs_outside_the_training_range_are_clamped(self, kind):
@@ -153,7 +187,8 @@ class TestActuation:
         model = model.double().eval()
         with torch.no_grad():
             held = Range.of(model.encode(q, v, self.LOADS))
-        context = torch.stack([self.LOADS[i : i + 5] for i in (0, 5, 0, 0)])  # during each of four steps
+        # During each of four steps.
+        context = torch.stack([self.LOADS[i : i + 5] for i in (0, 5, 0, 0)])
         watched = LearnedPredictor(model, context, held)
 
         def predicted(q, v, step):
@@ -167,7 +202,10 @@ class TestActuation:
                     torch.testing.assert_close(one, other)
             assert watched.left_at.tolist() == [-1] * 5
             away = q[:5] - model.rest
-            far = [predicted(model.rest + size * away, size * v[:5], step) for step, size in ((2, 1e6), (3, 1e9))]
+            far = [
+                predicted(model.rest + size * away, size * v[:5], step)
+                for step, size in ((2, 1e6), (3, 1e9))
+            ]
         for one, other in zip(*far, strict=True):
             torch.testing.assert_close(one, other)
         assert watched.left_at.tolist() == [2] * 5
@@ -175,7 +213,9 @@ class TestActuation:
 
 def clamped_beam():
     mesh = box_hexahedra((0.1, 0.02, 0.02), (5, 1, 1))
-    return Simulator(Body(mesh, fixed=select_vertices(mesh, x=0.0)), Corotated(2e5, 0.3), gravity=(0.0, 0.0, 0.0))
+    return Simulator(
+        Body(mesh, fixed=select_vertices(mesh, x=0.0)), Corotated(2e5, 0.3), gravity=(0.0, 0.0, 0.0)
+    )
 
 
 def test_displacement_modes_keep_a_weak_bending_force_and_drop_a_strong_one_without_effect():
@@ -191,7 +231,10 @@ def test_displacement_modes_keep_a_weak_bending_force_and_drop_a_strong_one_with
     coder = displacement_coder(forces, stiffness, 1)
     kept = coder.decode(coder.encode(forces))
     moved = stiffness.displacements((kept - forces).flatten(1).T.numpy())
-    assert np.abs(moved).max() < 0.05 * np.abs(stiffness.displacements(forces.flatten(1).T.numpy())).max()
+    assert (
+        np.abs(moved).max()
+        < 0.05 * np.abs(stiffness.displacements(forces.flatten(1).T.numpy())).max()
+    )
     assert float((kept - forces).norm()) > 0.9 * float((amounts[:, 1:, None] * squeeze).norm())
     plain = pod_coder(forces, 1)
     assert float((plain.decode(plain.encode(forces)) - forces).norm()) < 0.2 * float(forces.norm())
@@ -203,11 +246,17 @@ def test_a_network_without_velocity_inputs_is_restored_with_its_dual_modes():
     simulator = clamped_beam()
     rest, n = simulator.rest_positions, simulator.body.n_vertices
     random = torch.Generator().manual_seed(0)
-    q, v, force = (1e-3 * torch.randn(20, n, 3, generator=random, dtype=torch.float64) for _ in range(3))
+    q, v, force = (
+        1e-3 * torch.randn(20, n, 3, generator=random, dtype=torch.float64) for _ in range(3)
+    )
     sizes = {"position_modes": 3, "velocity_modes": 0, "force_modes": 2}
     config = NetworkSettings(**sizes, blocks=1, layers=1, width=8, activation="silu")
     model = (
-        build_model(ResidualForce, config, rest, rest + q, v, force, stiffness=RestStiffness(simulator)).double().eval()
+        build_model(
+            ResidualForce, config, rest, rest + q, v, force, stiffness=RestStiffness(simulator)
+        )
+        .double()
+        .eval()
     )
     torch.testing.assert_close(model(rest + q, v), model(rest + q, 10.0 * v))
     assert not torch.equal(model(rest + 2.0 * q, v), model(rest + q, v))
@@ -227,7 +276,11 @@ def test_modes_of_large_bodies_are_those_of_small_ones(monkeypatch):
 
 def test_rest_stiffness_knows_no_viscosity_and_wants_a_body_that_is_held():
     plain, damped = (
-        RestStiffness(dataclasses.replace(clamped_beam(), material=Corotated(2e5, 0.3, stiffness_damping=beta)))
+        RestStiffness(
+            dataclasses.replace(
+                clamped_beam(), material=Corotated(2e5, 0.3, stiffness_damping=beta)
+            )
+        )
         for beta in (0.0, 0.01)
     )
     force = np.random.default_rng(0).standard_normal((3 * 24, 2))
@@ -244,8 +297,12 @@ BOX = Range(torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 4.0]), torch.tensor([2
 def motion(modes, seed):
     """(S, N, 3) samples in a space of few modes, and the (M, 3 N) orthonormal modes."""
     random = torch.Generator().manual_seed(seed)
-    basis = torch.linalg.qr(torch.randn(3 * VERTICES, modes, generator=random, dtype=torch.float64))[0].T
-    return (torch.randn(SAMPLES, modes, generator=random, dtype=torch.float64) @ basis).view(SAMPLES, -1, 3), basis
+    basis = torch.linalg.qr(
+        torch.randn(3 * VERTICES, modes, generator=random, dtype=torch.float64)
+    )[0].T
+    return (torch.randn(SAMPLES, modes, generator=random, dtype=torch.float64) @ basis).view(
+        SAMPLES, -1, 3
+    ), basis
 
 
 @pytest.fixture
@@ -260,14 +317,18 @@ def trained():
 
 def across(basis, size):
     """A field (N, 3) without any part along modes, whose root mean square distance is `size`."""
-    field = torch.randn(3 * VERTICES, dtype=torch.float64, generator=torch.Generator().manual_seed(9))
+    field = torch.randn(
+        3 * VERTICES, dtype=torch.float64, generator=torch.Generator().manual_seed(9)
+    )
     field = field - basis.T @ (basis @ field)
     return (size * math.sqrt(VERTICES) * field / field.norm()).view(VERTICES, 3)
 
 
 def test_the_distance_from_the_modes_is_that_of_what_they_cannot_represent(trained):
     model, q, v, by_u, by_v = trained
-    torch.testing.assert_close(model.missed(q, v), torch.zeros(SAMPLES, 2, dtype=q.dtype), rtol=0.0, atol=1e-12)
+    torch.testing.assert_close(
+        model.missed(q, v), torch.zeros(SAMPLES, 2, dtype=q.dtype), rtol=0.0, atol=1e-12
+    )
     away = model.missed(q + across(by_u, 3e-3), v - across(by_v, 0.2))
     torch.testing.assert_close(away, q.new_tensor([[3e-3, 0.2]]).expand(SAMPLES, 2))
 
@@ -285,22 +346,28 @@ def test_the_distance_from_the_modes_is_that_of_what_they_cannot_represent(train
     ],
 )
 def test_the_weight_falls_from_one_within_to_zero_beyond(inputs, missed, weight):
-    assert BOX.weight(torch.tensor([inputs]), torch.tensor([missed])).tolist() == pytest.approx([weight], abs=1e-5)
+    assert BOX.weight(torch.tensor([inputs]), torch.tensor([missed])).tolist() == pytest.approx(
+        [weight], abs=1e-5
+    )
 
 
 def test_a_predictor_scales_its_force_and_moves_to_a_device_with_its_range(trained):
     model, q, v, by_u, _ = trained
-    missed = model.missed(q + across(by_u, 1e-3), v)  # as if motions had been this far from the modes
+    # As if motions had been this far from the modes.
+    missed = model.missed(q + across(by_u, 1e-3), v)
     with torch.no_grad():
         guarded = Range.of(model.encode(q, v), missed)
         fading = LearnedPredictor(model, range_=guarded)
         constant = LearnedPredictor(model, range_=Range(guarded.low, guarded.high))
         for size, weight in ((0.0, 1.0), (1.2e-3, 1.0), (1.875e-3, 0.5), (2.6e-3, 0.0)):
             state = State(q[:5] + across(by_u, size), v[:5])
-            torch.testing.assert_close(fading(state, 0), weight * constant(state, 0), atol=1e-9, rtol=1e-6)
+            torch.testing.assert_close(
+                fading(state, 0), weight * constant(state, 0), atol=1e-9, rtol=1e-6
+            )
         assert constant(state, 0).abs().max() > 1e-3
     assert fading.left_at.tolist() == [-1] * 5
     learned = Learned(torch.nn.Linear(2, 1), BOX).to(torch.device("meta"))
-    assert {x.device.type for x in (*learned.range_.edges, learned.range_.missed, *learned.network.parameters())} == {
-        "meta"
-    }
+    assert {
+        x.device.type
+        for x in (*learned.range_.edges, learned.range_.missed, *learned.network.parameters())
+    } == {"meta"}

@@ -1,4 +1,6 @@
-"""Residual forces of a tiny beam, of all its vertices or of markers: replayed, by both methods, by brute force."""
+"""Residual forces of a tiny beam, of all its vertices or of markers:
+replayed, by both methods, by brute force.
+"""
 
 import numpy as np
 import pytest
@@ -24,7 +26,9 @@ STEMS = [[0.06, 0.012, 0.045], [0.03, -0.015, 0.013], [0.075, 0.02, 0.01]]
 def reconstructor(sim, method, regularisation, tolerance, max_iterations, observation=WHOLE_STATE):
     """The method with these settings."""
     settings = {"method": method, "regularisation": regularisation, "tolerance": tolerance}
-    return make_reconstructor(sim, ReconstructionSettings(**settings, max_iterations=max_iterations), observation)
+    return make_reconstructor(
+        sim, ReconstructionSettings(**settings, max_iterations=max_iterations), observation
+    )
 
 
 def simulator(stiffness_damping=0.0, **settings):
@@ -33,7 +37,9 @@ def simulator(stiffness_damping=0.0, **settings):
 
 
 def observation(steps=1, weights=(0.1,), damping=0.0, **settings):
-    """Positions (T + 1, B, 12, 3) of the beam let go from weights at its tip, and its first state."""
+    """Positions (T + 1, B, 12, 3) of the beam let go
+    from weights at its tip, and its first state.
+    """
     material = Corotated(264e3, 0.499, stiffness_damping=damping)
     real = Simulator(BODY, material, relative_tolerance=1e-11, **settings)
     force = torch.zeros(len(weights), 12, 3, dtype=torch.float64)
@@ -46,8 +52,14 @@ def markers_at(*rows):
     return MarkerMap.at_vertices(torch.tensor(rows))
 
 
-OBSERVED = {"whole": WHOLE_STATE, "vertices": markers_at([5, 10]), "pairs": markers_at([5, 8, 11], [9, 6, 4])}
-OBSERVED |= {kind: bind_markers(MESH, STEMS, [*"abc"], kind=kind, vertices=TIP, patch=0.06) for kind in KINDS}
+OBSERVED = {
+    "whole": WHOLE_STATE,
+    "vertices": markers_at([5, 10]),
+    "pairs": markers_at([5, 8, 11], [9, 6, 4]),
+}
+OBSERVED |= {
+    kind: bind_markers(MESH, STEMS, [*"abc"], kind=kind, vertices=TIP, patch=0.06) for kind in KINDS
+}
 
 
 def reconstruct(solver, start, observed):
@@ -59,10 +71,15 @@ def reconstruct(solver, start, observed):
 class TestMarkerMap:
     def test_it_weighs_vertices_and_its_transpose_is_its_transpose(self):
         random = torch.Generator().manual_seed(0)
-        markers = MarkerMap(torch.tensor([[[0, 1], [5, 5]], [[2, 3], [7, 0]]]), torch.rand(2, 2, 2, generator=random))
+        markers = MarkerMap(
+            torch.tensor([[[0, 1], [5, 5]], [[2, 3], [7, 0]]]),
+            torch.rand(2, 2, 2, generator=random),
+        )
         q = torch.rand(2, 8, 3, generator=random)
         at = markers(q)
-        torch.testing.assert_close(at[0, 0], markers.weights[0, 0, 0] * q[0, 0] + markers.weights[0, 0, 1] * q[0, 1])
+        torch.testing.assert_close(
+            at[0, 0], markers.weights[0, 0, 0] * q[0, 0] + markers.weights[0, 0, 1] * q[0, 1]
+        )
         torch.testing.assert_close(at[0, 1], markers.weights[0, 1].sum() * q[0, 5])
         product = (markers.transposed_jacobian(q[:1]).mT @ q.reshape(2, 24, 1)).reshape(2, 2, 3)
         torch.testing.assert_close(product, at)
@@ -74,11 +91,13 @@ class TestMarkerMap:
 
 
 class TestGaussNewton:
-    def test_without_regularisation_it_hits_the_observation_with_the_force_of_the_equation_of_motion(self, device):
+    def test_without_regularisation_it_hits_the_observation_with_the_force_of_motion(self, device):
         observed, start = observation()
         sim = simulator(device=device)
         on_device = State(start.q.to(device), start.v.to(device))
-        result = reconstructor(sim, "gauss_newton", 0.0, **TIGHT).step(on_device, observed[1].to(device))
+        result = reconstructor(sim, "gauss_newton", 0.0, **TIGHT).step(
+            on_device, observed[1].to(device)
+        )
         np.testing.assert_allclose(result.state.q.cpu(), observed[1], rtol=0, atol=1e-16)
         speed = (observed[1] - observed[0]) / sim.time_step
         np.testing.assert_allclose(result.state.v.cpu(), speed, rtol=0, atol=1e-12)
@@ -89,9 +108,13 @@ class TestGaussNewton:
 
     @pytest.mark.parametrize(("regularisation", "most"), [(1e-8, 5), (1e-3, 14)])
     def test_the_last_step_takes_no_new_factor(self, regularisation, most, monkeypatch):
-        """It is within the tolerance of the minimum that exact steps reach, also where forces are large there."""
+        """It is within the tolerance of the minimum that exact steps reach,
+        also where forces are large there.
+        """
         made, shifted = [], Linearisation.shifted
-        monkeypatch.setattr(Linearisation, "shifted", lambda self, scale: (made.append(1), shifted(self, scale))[1])
+        monkeypatch.setattr(
+            Linearisation, "shifted", lambda self, scale: (made.append(1), shifted(self, scale))[1]
+        )
         observed, start = observation(5)
         found, counts = {}, []
         for tolerance in (1e-10, 1e-14):
@@ -120,24 +143,34 @@ class TestGaussNewton:
         def jacobian(x):
             return (missing(x + steps) - missing(x - steps)).T / 2e-6
 
-        assert float(torch.linalg.eigvalsh(jacobian(observed)).min()) < -1.0 / np.sqrt(regularisation)
+        assert float(torch.linalg.eigvalsh(jacobian(observed)).min()) < -1.0 / np.sqrt(
+            regularisation
+        )
         slope = jacobian(q[0]) @ force[0, 0, FREE].flatten()
         missed = (q[0] - observed)[0, FREE].flatten()
-        np.testing.assert_allclose(missed, -regularisation * slope, rtol=0, atol=1e-5 * float(missed.abs().max()))
+        np.testing.assert_allclose(
+            missed, -regularisation * slope, rtol=0, atol=1e-5 * float(missed.abs().max())
+        )
 
-    @pytest.mark.parametrize(("name", "remedy"), [("whole", "max_iterations"), ("vertices", "regularisation")])
+    @pytest.mark.parametrize(
+        ("name", "remedy"), [("whole", "max_iterations"), ("vertices", "regularisation")]
+    )
     def test_too_few_iterations(self, name, remedy):
         observed, start = observation()
         settings = {"tolerance": 1e-12, "max_iterations": 1, "observation": OBSERVED[name]}
         solver = reconstructor(simulator(), "gauss_newton", 1e-4, **settings)
-        with pytest.raises(ConvergenceError, match=rf"moved by .* raise .*reconstruction\.{remedy}"):
+        with pytest.raises(
+            ConvergenceError, match=rf"moved by .* raise .*reconstruction\.{remedy}"
+        ):
             solver.step(start, solver.observation(observed[1]))
 
     @pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
     def test_errors_of_the_steps_do_not_add_up(self, integrator):
         damping = 1e-3 if integrator == "midpoint" else 0.0  # undamped, it rings
         observed, start = observation(40, damping=damping, integrator=integrator)
-        solver = reconstructor(simulator(damping, integrator=integrator), "gauss_newton", 1e-9, **TIGHT)
+        solver = reconstructor(
+            simulator(damping, integrator=integrator), "gauss_newton", 1e-9, **TIGHT
+        )
         q, _ = reconstruct(solver, start, observed)
         missed = (q - observed[1:]).abs().amax((1, 2, 3))
         assert float(missed[20:].max()) < float(missed[:20].max())
@@ -151,16 +184,26 @@ class TestGaussNewton:
             for integrator, damping in zip(INTEGRATORS, (2e-3, 0, 2e-3), strict=True)
         ),
         *(("vertices", "bdf2", 1e-4, 0.0), ("vertices", "implicit_euler", 1e-6, 0.0)),
-        *((kind, integrator, 1e-6, 0.0) for kind, integrator in zip(KINDS, INTEGRATORS, strict=False)),
+        *(
+            (kind, integrator, 1e-6, 0.0)
+            for kind, integrator in zip(KINDS, INTEGRATORS, strict=False)
+        ),
     ],
 )
 def test_the_published_method_finds_the_same_minimum(name, integrator, regularisation, damping):
-    """Stems that turn make the map nonlinear: both ways to the minimum need its derivative where the body is."""
+    """Stems that turn make the map nonlinear: both ways
+    to the minimum need its derivative where the body is.
+    """
     markers, sim = OBSERVED[name], simulator(damping, integrator=integrator)
-    observed, start = observation(1 if name in KINDS else 2, (0.5 if name in KINDS else 0.1,), integrator=integrator)
+    observed, start = observation(
+        1 if name in KINDS else 2, (0.5 if name in KINDS else 0.1,), integrator=integrator
+    )
     (q, force), (q_other, force_other) = (
         reconstruct(reconstructor(sim, *settings, observation=markers, **bounds), start, observed)
-        for *settings, bounds in (("gauss_newton", regularisation, TIGHT), ("lbfgsb", regularisation, PUBLISHED))
+        for *settings, bounds in (
+            ("gauss_newton", regularisation, TIGHT),
+            ("lbfgsb", regularisation, PUBLISHED),
+        )
     )
 
     def objective(t, q, force):
@@ -168,7 +211,9 @@ def test_the_published_method_finds_the_same_minimum(name, integrator, regularis
         return float(missed.square().sum() + regularisation * force[t].square().sum())
 
     for t in range(len(q)):
-        assert objective(t, q, force) <= objective(t, q_other, force_other) * (1.0 + (1e-5 if t else 1e-9))
+        assert objective(t, q, force) <= objective(t, q_other, force_other) * (
+            1.0 + (1e-5 if t else 1e-9)
+        )
     np.testing.assert_allclose(force, force_other, rtol=0, atol=2e-3 * float(force.abs().max()))
     missed = float((q - observed[1:]).abs().max())
     np.testing.assert_allclose(q, q_other, rtol=0, atol=2e-3 * missed if name == "whole" else 1e-7)
@@ -206,8 +251,12 @@ class TestLevenbergMarquardt:
             seen = markers(target)
             seen[1, 0] = torch.nan
             damped, plain = (
-                reconstructor(sim, method, 1e-6, **TIGHT, observation=markers).step(state, seen, first_guess=first)
-                for method, state in zip(("levenberg_marquardt", "gauss_newton"), states, strict=True)
+                reconstructor(sim, method, 1e-6, **TIGHT, observation=markers).step(
+                    state, seen, first_guess=first
+                )
+                for method, state in zip(
+                    ("levenberg_marquardt", "gauss_newton"), states, strict=True
+                )
             )
             scale = float(plain.force.abs().max())
             np.testing.assert_allclose(damped.force, plain.force, rtol=0, atol=1e-6 * scale)
@@ -219,7 +268,9 @@ class TestLevenbergMarquardt:
         """Where full steps overshoot: no small change of the force makes the objective smaller."""
         _, start = observation(1, (0.1, 0.1))
         sim, markers = simulator(), markers_at([6, 11], [6, 11])
-        target = markers(start.q) + torch.tensor([[[-0.03, 0.0, 0.05]], [[0.0, 0.0, 1e-3]]], dtype=torch.float64)
+        target = markers(start.q) + torch.tensor(
+            [[[-0.03, 0.0, 0.05]], [[0.0, 0.0, 1e-3]]], dtype=torch.float64
+        )
         solver = reconstructor(sim, "levenberg_marquardt", 1e-5, 1e-10, 200, observation=markers)
         result = solver.step(start, target)
         force = result.force.clone().requires_grad_(True)
@@ -234,7 +285,10 @@ class TestLevenbergMarquardt:
     ("settings", "sentence"),
     [
         ({"method": "adam"}, "ReconstructionSettings.method is 'adam'"),
-        ({"regularisation": -1e-9, "observation": WHOLE_STATE}, "ReconstructionSettings.regularisation"),
+        (
+            {"regularisation": -1e-9, "observation": WHOLE_STATE},
+            "ReconstructionSettings.regularisation",
+        ),
         ({"regularisation": 0.0}, "reconstruction.regularisation"),
         ({"tolerance": 0.0}, "ReconstructionSettings.tolerance"),
         ({"max_iterations": 0}, "ReconstructionSettings.max_iterations"),
@@ -242,7 +296,12 @@ class TestLevenbergMarquardt:
     ],
 )
 def test_bad_settings(settings, sentence):
-    good = {"observation": markers_at([8]), "method": "gauss_newton", "regularisation": 1e-6, **TIGHT}
+    good = {
+        "observation": markers_at([8]),
+        "method": "gauss_newton",
+        "regularisation": 1e-6,
+        **TIGHT,
+    }
     with pytest.raises(InputError) as error:
         reconstructor(simulator(), **{**good, **settings})
     assert sentence in str(error.value)

@@ -1,4 +1,6 @@
-"""Replays of observed motions: gradients, other weights and gravities, begins, and predictions from nearby motions."""
+"""Replays of observed motions: gradients, other weights and gravities,
+begins, and predictions from nearby motions.
+"""
 
 from dataclasses import replace
 
@@ -8,7 +10,17 @@ import torch
 
 from support.refusals import refuses
 from support.swinging_beam import MARKERS, MESH, TIP, blank, double, simulated
-from warp_resphys import Contact, Corotated, HalfSpace, Inputs, Simulator, SolverSettings, State, Tendons, box_hexahedra
+from warp_resphys import (
+    Contact,
+    Corotated,
+    HalfSpace,
+    Inputs,
+    Simulator,
+    SolverSettings,
+    State,
+    Tendons,
+    box_hexahedra,
+)
 from warp_resphys.data.markers import WHOLE_STATE
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.fem.bodies import Body, PointMass
@@ -16,7 +28,13 @@ from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.parameters import tilted_gravity
-from warp_resphys.learning.release import ReleaseSettings, begin_inputs, estimate_release, hold, sideways_shapes
+from warp_resphys.learning.release import (
+    ReleaseSettings,
+    begin_inputs,
+    estimate_release,
+    hold,
+    sideways_shapes,
+)
 from warp_resphys.learning.replay import Replay
 from warp_resphys.learning.start import Start
 from warp_resphys.learning.trial_batch import TrialBatch
@@ -27,7 +45,9 @@ from warp_resphys.stepping.rollout import sample
 
 def simulator(masses=(), kind=Simulator, **options):
     options = {"integrator": "bdf2", "material": Corotated(215e3, 0.45)} | options
-    body = Body(MESH, select_vertices(MESH, x=0.0), point_masses=[PointMass(m, TIP) for m in masses])
+    body = Body(
+        MESH, select_vertices(MESH, x=0.0), point_masses=[PointMass(m, TIP) for m in masses]
+    )
     return kind(body, time_step=0.01, **options)
 
 
@@ -40,7 +60,9 @@ def test_sampling_is_exact_on_parabolas_of_third_order_and_differentiable():
     parabola = torch.stack([1.0 + 2.0 * t - 3.0 * t**2, t**2])[..., None]
     times = double([[0.0, 0.013, 0.25, 0.4999, 0.5], [0.5, 0.31, 0.07, 0.0, 0.2]])
     values = sample(parabola, times, h)[..., 0]
-    torch.testing.assert_close(values[0], 1.0 + 2.0 * times[0] - 3.0 * times[0] ** 2, rtol=0.0, atol=1e-14)
+    torch.testing.assert_close(
+        values[0], 1.0 + 2.0 * times[0] - 3.0 * times[0] ** 2, rtol=0.0, atol=1e-14
+    )
     torch.testing.assert_close(values[1], times[1] ** 2, rtol=0.0, atol=1e-14)
     torch.testing.assert_close(sample(t[None] ** 3, t[None], h), t[None] ** 3, rtol=0.0, atol=1e-15)
     assert float(sample(parabola, double([[9.0], [9.0]]), h)[1, 0, 0]) == float(parabola[1, -1, 0])
@@ -60,12 +82,21 @@ def test_sampling_is_exact_on_parabolas_of_third_order_and_differentiable():
 def test_gravity_turns_by_its_components_and_keeps_its_strength():
     sim = simulator(gravity=(0.0, -9.8, 0.0))
     turned = tilted_gravity(sim, double([0.0, 0.1, 0.0]), double([0.0, 0.0, -0.2]))
-    expected = 9.8 * np.array([[0, -1, 0], [0.1, -1, 0] / np.sqrt(1.01), [0, -1, -0.2] / np.sqrt(1.04)])
+    expected = 9.8 * np.array(
+        [[0, -1, 0], [0.1, -1, 0] / np.sqrt(1.01), [0, -1, -0.2] / np.sqrt(1.04)]
+    )
     np.testing.assert_allclose(turned.numpy(), expected, atol=1e-12)
     oblique = tilted_gravity(simulator(gravity=(3.0, -2.0, 9.0)), double([0.3]), None)
     assert float(oblique.norm()) == pytest.approx(np.sqrt(94.0))
     assert tilted_gravity(sim, None, None).tolist() == [[0.0, -9.8, 0.0]]
-    refuses(InputError, "without gravity", tilted_gravity, simulator(gravity=(0.0, 0.0, 0.0)), double([0.1]), None)
+    refuses(
+        InputError,
+        "without gravity",
+        tilted_gravity,
+        simulator(gravity=(0.0, 0.0, 0.0)),
+        double([0.1]),
+        None,
+    )
 
 
 def test_sets_of_parameters_at_once_are_those_one_by_one():
@@ -91,23 +122,35 @@ def test_sets_of_parameters_at_once_are_those_one_by_one():
 
 def test_parts_have_their_own_parameters():
     """The parameter of one part leaves the other parts at their own or their common value."""
-    routes = {name: [[0.0, 0.01, z], [0.1, 0.01, z]] for name, z in (("low", 0.005), ("high", 0.015))}
+    routes = {
+        name: [[0.0, 0.01, z], [0.1, 0.01, z]] for name, z in (("low", 0.005), ("high", 0.015))
+    }
     tendons = Tendons(routes, stiffness=[300.0, 400.0])
     sim = Simulator(Body(MESH, select_vertices(MESH, x=0.0), energies=(tendons,)))
     replay = Replay(sim, lambda q: q, blank(masses=(0.0, 0.0)))
-    assert {"tendon_stiffness", "tendon_stiffness_low", "tendon_stiffness_high"} <= {*replay.parameter_names}
+    assert {"tendon_stiffness", "tendon_stiffness_low", "tendon_stiffness_high"} <= {
+        *replay.parameter_names
+    }
     value = double([1.0, 2.0])
     for given, wanted in (
         ({"tendon_stiffness_high": value}, [[300.0, 1.0], [300.0, 2.0]]),
-        ({"tendon_stiffness_low": value, "tendon_stiffness_high": 3.0 * value}, [[1.0, 3.0], [2.0, 6.0]]),
-        ({"tendon_stiffness": 5.0 * value, "tendon_stiffness_low": value}, [[1.0, 5.0], [2.0, 10.0]]),
+        (
+            {"tendon_stiffness_low": value, "tendon_stiffness_high": 3.0 * value},
+            [[1.0, 3.0], [2.0, 6.0]],
+        ),
+        (
+            {"tendon_stiffness": 5.0 * value, "tendon_stiffness_low": value},
+            [[1.0, 5.0], [2.0, 10.0]],
+        ),
     ):
         constants, _, _ = replay.prepare(given)
         result = constants.values[1]["tendon_stiffness"]  # two trials for each set of parameters
         torch.testing.assert_close(result, double(wanted).repeat_interleave(2, 0))
 
 
-@pytest.mark.parametrize(("integrator", "nu"), [("implicit_euler", 0.45), ("bdf2", 0.499), ("midpoint", 0.499)])
+@pytest.mark.parametrize(
+    ("integrator", "nu"), [("implicit_euler", 0.45), ("bdf2", 0.499), ("midpoint", 0.499)]
+)
 def test_gradients_of_every_parameter_agree_with_central_differences(integrator, nu):
     sim = simulator(integrator=integrator, relative_tolerance=1e-11)
     motions = blank(frames=8)
@@ -119,7 +162,9 @@ def test_gradients_of_every_parameter_agree_with_central_differences(integrator,
     scale = double([1e5, 1e-3, 1000.0, 1.0, 0.01, 1.0, 1.0, 1.0])
 
     def losses(values):
-        errors = replay.errors(replay(release, dict(zip(replay.parameter_names, values.mT, strict=True))))
+        errors = replay.errors(
+            replay(release, dict(zip(replay.parameter_names, values.mT, strict=True)))
+        )
         return errors.square().sum((1, 2, 3, 4))
 
     x = at[None].clone().requires_grad_()
@@ -129,19 +174,28 @@ def test_gradients_of_every_parameter_agree_with_central_differences(integrator,
         ahead, behind = losses(torch.cat([at + steps, at - steps])).view(2, -1)
     differences = (ahead - behind) / 2e-4
     assert float(differences.abs().min()) > 0.0
-    torch.testing.assert_close(gradient[0] * scale, differences, rtol=1e-4, atol=1e-5 * float(differences.abs().max()))
+    torch.testing.assert_close(
+        gradient[0] * scale, differences, rtol=1e-4, atol=1e-5 * float(differences.abs().max())
+    )
     points = torch.cat([at[None], at + 0.1 * steps])
     varied, _ = replay.varied(release, dict(zip(replay.parameter_names, points.mT, strict=True)))
     along = replay.errors(varied).square().sum((1, 2, 3, 4))
     torch.testing.assert_close(
-        (along[1:] - along[0]) / 1e-5, differences, rtol=1e-3, atol=1e-4 * float(differences.abs().max())
+        (along[1:] - along[0]) / 1e-5,
+        differences,
+        rtol=1e-3,
+        atol=1e-4 * float(differences.abs().max()),
     )
 
 
 def test_states_within_an_obstacle_are_no_derivatives():
     """The second floor is where the first body, whose floor lies far below, falls through it."""
     floor = Contact({"floor": HalfSpace(position=(0.0, 0.0, -0.002))})
-    sim = Simulator(Body(MESH, select_vertices(MESH, x=0.0), energies=[floor]), Corotated(5e4, 0.45), time_step=0.01)
+    sim = Simulator(
+        Body(MESH, select_vertices(MESH, x=0.0), energies=[floor]),
+        Corotated(5e4, 0.45),
+        time_step=0.01,
+    )
     replay = Replay(sim, MARKERS, blank(20, masses=(0.0,)))
     with pytest.raises(ConvergenceError, match="no derivatives from step 2 on"):
         replay.varied(at_rest(sim, 1), {"obstacle_z": double([-0.05, 0.0])})
@@ -150,7 +204,10 @@ def test_states_within_an_obstacle_are_no_derivatives():
 def test_a_motion_whose_markers_were_never_seen_is_refused():
     motions = blank()
     with pytest.raises(InputError, match="'m1' was seen"):
-        replace(motions, observed=torch.where(double([[[[0.0]]], [[[1.0]]]]) > 0, torch.nan, motions.observed))
+        replace(
+            motions,
+            observed=torch.where(double([[[[0.0]]], [[[1.0]]]]) > 0, torch.nan, motions.observed),
+        )
 
 
 def test_a_held_body_has_its_markers_where_they_were_and_is_at_rest():
@@ -167,7 +224,8 @@ def test_a_held_body_has_its_markers_where_they_were_and_is_at_rest():
 
 
 def test_releases_within_twice_what_is_expected_are_recovered_in_any_basis(monkeypatch):
-    """Delays between any two frames: each frame that sees the body at rest or moving is a minimum of its own.
+    """Delays between any two frames: each frame that sees the body
+    at rest or moving is a minimum of its own.
 
     The beam is square: any rotation of its first two vibrations is as good a basis.
     """
@@ -181,7 +239,10 @@ def test_releases_within_twice_what_is_expected_are_recovered_in_any_basis(monke
     monkeypatch.setattr("warp_resphys.learning.release.vibration_modes", rotated)
     sim, motions = simulator(), blank(frames=12, masses=(0.0, 0.05) * (count // 2))
     replay = Replay(sim, MARKERS, motions)
-    values = 4.0 * torch.rand(count, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 2.0
+    values = (
+        4.0 * torch.rand(count, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        - 2.0
+    )
     q = hold(replay, 6)
     release = Start(State(q, torch.zeros_like(q)), 0.01 * values)
     seen = replay(release)[0]
@@ -218,7 +279,9 @@ def test_a_sideways_held_body_is_identified_from_its_initial_motion():
     q = hold(replay, 6)
     bends = double([[0.002], [-0.003]])
     bent = q + torch.einsum("bk,knc->bnc", bends, shapes)
-    truth = Start(State(bent, torch.zeros_like(q)), torch.zeros(2).double(), MARKERS(q) - MARKERS(bent))
+    truth = Start(
+        State(bent, torch.zeros_like(q)), torch.zeros(2).double(), MARKERS(q) - MARKERS(bent)
+    )
     seen = replay(truth)[0]
     torch.testing.assert_close(seen[:, 0], MARKERS(q), rtol=0.0, atol=1e-12)
     settings = ReleaseSettings(delay=0.0, sideways=0.002, window=0.1, noise=1e-5)
@@ -234,7 +297,8 @@ def test_a_sideways_held_body_is_identified_from_its_initial_motion():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"window": 0.0}, {"noise": -1.0}, {"delay": -0.1}, {"velocity_modes": -1}, {"sideways": -1.0}]
+    "wrong",
+    [{"window": 0.0}, {"noise": -1.0}, {"delay": -0.1}, {"velocity_modes": -1}, {"sideways": -1.0}],
 )
 def test_settings_out_of_range_are_refused(wrong):
     refuses(InputError, f"release.{next(iter(wrong))}", parse, ReleaseSettings, wrong, "release")
@@ -257,7 +321,10 @@ class Watched(Simulator):
 
     def step(self, *arguments):
         new = super().step(*arguments)
-        Watched.steps, Watched.iterations = Watched.steps + 1, Watched.iterations + int(new.report.iterations.sum())
+        Watched.steps, Watched.iterations = (
+            Watched.steps + 1,
+            Watched.iterations + int(new.report.iterations.sum()),
+        )
         return new
 
 
@@ -269,23 +336,37 @@ def counted(function, *arguments):
 
 def replayed(frames, kind=Simulator, energies=(), static=False, **options):
     """Two trials from rest under different forces at the tip, observed at all vertices."""
-    sim = kind(Body(BAR, CLAMP, energies=energies), SOFT, time_step=0.01, integrator="bdf2", **options)
-    times = torch.zeros(2, 1).double() if static else 0.01 * torch.arange(frames).double().expand(2, -1)
+    sim = kind(
+        Body(BAR, CLAMP, energies=energies), SOFT, time_step=0.01, integrator="bdf2", **options
+    )
+    times = (
+        torch.zeros(2, 1).double() if static else 0.01 * torch.arange(frames).double().expand(2, -1)
+    )
     held = sim.rest_positions.expand(2, -1, -1)
     force = torch.zeros(2, *held.shape[1:]).double()
     force[:, select_vertices(BAR, x=0.1), 1] = torch.tensor([[0.002], [-0.004]]).double()
     at = Inputs(external_force=force)
-    blank = TrialBatch(("a", "b"), times, held[:, None].repeat(1, frames, 1, 1), held, at, at if static else Inputs())
+    blank = TrialBatch(
+        ("a", "b"),
+        times,
+        held[:, None].repeat(1, frames, 1, 1),
+        held,
+        at,
+        at if static else Inputs(),
+    )
     replay = Replay(sim, WHOLE_STATE, blank)
     start = Start.resting(held.clone())
     return simulated(replay, start, VALUES, noise=1e-4), start
 
 
 @pytest.mark.parametrize(
-    ("static", "energies"), [(True, ()), (False, (Tendons([[[0.0, 0.015, 0.02], [0.1, 0.015, 0.02]]], friction=0.2),))]
+    ("static", "energies"),
+    [(True, ()), (False, (Tendons([[[0.0, 0.015, 0.02], [0.1, 0.015, 0.02]]], friction=0.2),))],
 )
 def test_varied_trials_differ_from_the_first_as_trials_simulated_one_by_one(static, energies):
-    replay, start = replayed(1 if static else 8, energies=energies, static=static, relative_tolerance=1e-12)
+    replay, start = replayed(
+        1 if static else 8, energies=energies, static=static, relative_tolerance=1e-12
+    )
     step = 1e-4
     sets = {
         "youngs_modulus": torch.tensor([2e5, 2e5 * (1.0 + step), 2e5]).double(),
@@ -296,7 +377,9 @@ def test_varied_trials_differ_from_the_first_as_trials_simulated_one_by_one(stat
     varied, _ = replay.varied(start, sets)
     wanted = alone[1:] - alone[0]
     torch.testing.assert_close(varied[0], alone[0], rtol=0.0, atol=1e-10)
-    torch.testing.assert_close(varied[1:] - varied[0], wanted, rtol=0.0, atol=1e-2 * float(wanted.abs().max()))
+    torch.testing.assert_close(
+        varied[1:] - varied[0], wanted, rtol=0.0, atol=1e-2 * float(wanted.abs().max())
+    )
 
 
 def test_predicted_motions_take_fewer_iterations_and_have_the_same_derivatives():
@@ -308,7 +391,9 @@ def test_predicted_motions_take_fewer_iterations_and_have_the_same_derivatives()
     misfit.forget()
     again, _, without = counted(misfit.linearise, unit + 0.002)
     assert warm < 0.6 * min(cold, without)
-    np.testing.assert_allclose(near.gradient, again.gradient, rtol=1e-5, atol=1e-5 * np.abs(again.gradient).max())
+    np.testing.assert_allclose(
+        near.gradient, again.gradient, rtol=1e-5, atol=1e-5 * np.abs(again.gradient).max()
+    )
     np.testing.assert_allclose(near.gauss_newton, again.gauss_newton, rtol=1e-5)
 
 
@@ -316,9 +401,16 @@ def test_a_step_that_fails_from_its_prediction_is_solved_without():
     replay, start = replayed(6)
     values = {name: torch.tensor([value]).double() for name, value in VALUES.items()}
     wanted = replay.states(start, values)
-    turned = wanted[0].q.flip(1)  # inside out, from where the solver does not come back in few iterations
-    replay = Replay(replace(replay.simulator, solver=SolverSettings(max_iterations=20)), WHOLE_STATE, replay.trials)
+    # Inside out, from where the solver does not come back in few iterations.
+    turned = wanted[0].q.flip(1)
+    replay = Replay(
+        replace(replay.simulator, solver=SolverSettings(max_iterations=20)),
+        WHOLE_STATE,
+        replay.trials,
+    )
     with pytest.raises(ConvergenceError):
-        replay.simulator.step(wanted[0], replay.trials.inputs.at(0), replay.prepare(values)[0], near=turned)
+        replay.simulator.step(
+            wanted[0], replay.trials.inputs.at(0), replay.prepare(values)[0], near=turned
+        )
     again = replay.states(start, values, lambda number: turned if number == 1 else None)
     torch.testing.assert_close(again[-1].q, wanted[-1].q, rtol=0.0, atol=1e-6)

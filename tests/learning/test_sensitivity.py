@@ -1,4 +1,5 @@
-"""Variances of predicted markers, predictions without a trial, and what would remain if inputs or places were free.
+"""Variances of predicted markers, predictions without a trial,
+and what would remain if inputs or places were free.
 
 Derivatives are made up, and so are the errors that are made of them.
 """
@@ -11,7 +12,12 @@ import pytest
 
 from warp_resphys.data.rigid_bodies import arms
 from warp_resphys.learning.identification.search import Identification
-from warp_resphys.learning.identification.sensitivity import Sensitivity, free_fits, left_out_changes, parameter_spread
+from warp_resphys.learning.identification.sensitivity import (
+    Sensitivity,
+    free_fits,
+    left_out_changes,
+    parameter_spread,
+)
 from warp_resphys.settings.performed import CORNERS
 
 RANDOM = np.random.default_rng(0)
@@ -28,7 +34,11 @@ WITHOUT = {
 }
 PLACED = {"offsets": {}, "shift": [], "turn": [], "centre": []}
 PLACED = {**PLACED, "sessions": {"monday": PLACED}}
-UNLIMITED = {"poorest": {}, "poorest_deviation": 0.0, "ranges": dict.fromkeys(("youngs_modulus", "density"), 1e12)}
+UNLIMITED = {
+    "poorest": {},
+    "poorest_deviation": 0.0,
+    "ranges": dict.fromkeys(("youngs_modulus", "density"), 1e12),
+}
 IDENTIFIED = {
     "uncertainty": {
         "deviation": {"youngs_modulus": 2e3, "density": 40.0},
@@ -41,7 +51,9 @@ IDENTIFIED = {
 
 
 def trials(labels=("A", "B"), session=SESSIONS.get, **inputs):
-    return SimpleNamespace(observed=np.zeros((2, 1, len(labels), 3)), labels=labels, session=session, inputs=inputs)
+    return SimpleNamespace(
+        observed=np.zeros((2, 1, len(labels), 3)), labels=labels, session=session, inputs=inputs
+    )
 
 
 FOUND = Identification.from_plain(IDENTIFIED)
@@ -67,23 +79,32 @@ def due_to(name, deviation, correlation):
 def test_a_new_session_adds_the_prior_of_its_placement():
     uncertainty = IDENTIFIED["uncertainty"]
     spread = parameter_spread(trials(), NAMES, FOUND, LINEAR)
-    of_parameters = [due_to(name, uncertainty["deviation"], uncertainty["correlation"]) for name in NAMES]
+    of_parameters = [
+        due_to(name, uncertainty["deviation"], uncertainty["correlation"]) for name in NAMES
+    ]
     np.testing.assert_allclose(spread[0], of_parameters[0])
     added = np.einsum("tmck,k->tmc", LINEAR["b"].by_placement ** 2, NEW_SESSION**2).mean(-1)
     np.testing.assert_allclose(spread[1], of_parameters[1] + added)
 
 
 def test_the_position_of_a_rigid_body_does_not_vary_with_its_orientation():
-    """0.1 mm along x and 0.5 degrees about z, of a parameter, and again of the placement in a new session."""
+    """0.1 mm along x and 0.5 degrees about z, of a parameter,
+    and again of the placement in a new session.
+    """
     corners = arms(0.0573)
     turning = np.radians(0.5) * np.cross([0.0, 0.0, 1.0], corners)
     moved = np.stack([np.tile([1e-4, 0.0, 0.0], (4, 1)), turning], -1)  # (4, 3, 2)
     slopes = {"density": moved[None, ..., 0], "youngs_modulus": moved[None, ..., 1]}
     identified = {
-        "uncertainty": {"deviation": dict.fromkeys(slopes, 1.0), "correlation": np.eye(2).tolist(), **UNLIMITED},
+        "uncertainty": {
+            "deviation": dict.fromkeys(slopes, 1.0),
+            "correlation": np.eye(2).tolist(),
+            **UNLIMITED,
+        },
         "placement": {**PLACED, "new_session": np.eye(2).tolist()},
     }
-    plate, found = trials(tuple(f"plate {corner}" for corner in CORNERS)), Identification.from_plain(identified)
+    plate = trials(tuple(f"plate {corner}" for corner in CORNERS))
+    found = Identification.from_plain(identified)
     linear = dict.fromkeys(NAMES, Sensitivity(corners[None], slopes, moved[None]))
     spread = parameter_spread(plate, NAMES, found, linear)
     np.testing.assert_allclose(spread, np.array([[[1e-8 / 3.0]], [[2e-8 / 3.0]]]))
@@ -94,7 +115,11 @@ def test_a_trial_is_predicted_without_itself():
     np.testing.assert_allclose(spread[0], due_to("a", WITHOUT["deviation"], WITHOUT["correlation"]))
     changes = left_out_changes(trials(), NAMES, FOUND, LINEAR)
     slopes, places = LINEAR["a"].by_parameter, LINEAR["a"].by_placement
-    expected = 30.0 * slopes["density"] - 2e3 * slopes["youngs_modulus"] + places @ np.array(WITHOUT["placement"])
+    expected = (
+        30.0 * slopes["density"]
+        - 2e3 * slopes["youngs_modulus"]
+        + places @ np.array(WITHOUT["placement"])
+    )
     np.testing.assert_allclose(changes[0], expected)
     assert not changes[1].any()
     assert left_out_changes(trials(), ["b"], FOUND, LINEAR) is None
@@ -104,7 +129,9 @@ def test_a_trial_is_predicted_without_itself():
 
 
 ROUNDING = 1e-9  # mm
-DRIVEN = trials(session=lambda name: name[0], pressure=np.ones((1, 3, 1)), attached_mass=np.ones((1, 1)))
+DRIVEN = trials(
+    session=lambda name: name[0], pressure=np.ones((1, 3, 1)), attached_mass=np.ones((1, 1))
+)
 
 
 def driven(frames=40):
@@ -117,7 +144,9 @@ def fitted(errors, linear):
     return {entry["name"]: entry for entry in free_fits(DRIVEN, observed, simulated, linear)}
 
 
-@pytest.mark.parametrize(("key", "parameter"), [("scale", "pressure_factor"), ("zero", "pressure_zero")])
+@pytest.mark.parametrize(
+    ("key", "parameter"), [("scale", "pressure_factor"), ("zero", "pressure_zero")]
+)
 def test_an_error_of_one_kind_is_taken_away_by_that_kind(key, parameter):
     linear = {"a_1": driven()}
     entry = fitted({"a_1": -0.03 * linear["a_1"].by_parameter[parameter]}, linear)["a_1"]

@@ -1,4 +1,7 @@
-"""Samples after a break and dropouts of load cells are found; cycles, holds, steps and noise lose no sample."""
+"""Samples after a break and dropouts of load cells are found.
+
+Cycles, holds, steps and noise lose no sample.
+"""
 
 import numpy as np
 import pytest
@@ -15,11 +18,16 @@ LAW = {"c10": 30e3}
 
 
 def measured(noise=0.003, seed=0):
-    return stress("tension", STRAINS, LAW) * (1.0 + noise * np.random.default_rng(seed).standard_normal(300))
+    return stress("tension", STRAINS, LAW) * (
+        1.0 + noise * np.random.default_rng(seed).standard_normal(300)
+    )
 
 
 def found(strain, curve):
-    return {words.split()[-1]: np.flatnonzero(rows).tolist() for words, rows in strays(strain, curve).items()}
+    return {
+        words.split()[-1]: np.flatnonzero(rows).tolist()
+        for words, rows in strays(strain, curve).items()
+    }
 
 
 @pytest.mark.parametrize("zero", [0.0, 0.05])
@@ -30,7 +38,8 @@ def test_samples_after_a_break(count, zero):
     curve = np.append(measured(), 100.0 * random.standard_normal(count))
     test = MaterialTest("tension", strain, curve, zero=zero * curve.max())
     with pytest.warns(
-        ResphysWarning, match=f"a: {count} of {300 + count} samples left out, after the specimen broke: sample 301"
+        ResphysWarning,
+        match=f"a: {count} of {300 + count} samples left out, after the specimen broke: sample 301",
     ):
         law = identify_from_tests({"a": test}, density=1070.0)
     assert law.groups == []
@@ -57,8 +66,8 @@ def test_dropouts(noise, width, value):
     assert found(STRAINS, curve) == {"out": expected}
     test = MaterialTest("tension", STRAINS, curve, lines=np.arange(2, 302), zero=0.05 * 237e3)
     assert (
-        f"{3 * width} of 300 samples left out, where the load cell dropped out: line 32, strain 0.319"
-        in test.left_out[0]
+        f"{3 * width} of 300 samples left out, where the load cell dropped out: line 32, strain "
+        "0.319" in test.left_out[0]
     )
     with pytest.warns(ResphysWarning, match="dropped out"):
         law = identify_from_tests({"a": test}, density=1070.0)
@@ -103,10 +112,16 @@ def test_cycles_and_coarse_load_cells_lose_nothing(count, noise, kind):
         for law in (LAW, {"c10": 10e3, "ogden_3": 25e3}):
             exact = stress(kind, strain, law)
             noisy = (
-                exact * np.where(loads, 1.0, 0.4 + 0.6 * strain / most) * (1.0 + noise * random.standard_normal(count))
+                exact
+                * np.where(loads, 1.0, 0.4 + 0.6 * strain / most)
+                * (1.0 + noise * random.standard_normal(count))
             )
             size = np.abs(noisy).max() or 1.0
-            for curve in (noisy, np.round(noisy / size * 20.0) * size / 20.0, np.maximum(noisy - 0.3 * size, 0.0)):
+            for curve in (
+                noisy,
+                np.round(noisy / size * 20.0) * size / 20.0,
+                np.maximum(noisy - 0.3 * size, 0.0),
+            ):
                 assert found(strain, curve) == {}
 
 
@@ -121,7 +136,13 @@ def test_relaxation_loses_nothing(count, share):
     for strain in (ramp, steps, pulses, cycles):
         for time in (0.1, 1.0, 10.0):
             columns = stress_columns("tension", strain, ("c10", f"prony_{time}"), seconds)
-            assert found(strain, 30e3 * (1.0 - share) * columns["c10"] + 60e3 * share * columns[f"prony_{time}"]) == {}
+            assert (
+                found(
+                    strain,
+                    30e3 * (1.0 - share) * columns["c10"] + 60e3 * share * columns[f"prony_{time}"],
+                )
+                == {}
+            )
 
 
 def test_moduli_and_sizes_of_no_elastomer_are_refused():
@@ -136,8 +157,16 @@ def test_moduli_and_sizes_of_no_elastomer_are_refused():
         test = MaterialTest("tension", strain, factor * stress("tension", strain, LAW))
         law = identify_from_tests({"a": test}, density=1070.0)
         assert law.parameters["c10"] == pytest.approx(factor * 30e3, rel=1e-3)
-    refuses(InputError, "length of a specimen is 33 m: give it in m, 0.033 for 33 mm", Specimen, 33.0, (6.0, 3.0))
-    refuses(InputError, "section of a specimen is 3 m: give it in m, 0.003", Specimen, 0.033, (6.0, 3.0))
+    refuses(
+        InputError,
+        "length of a specimen is 33 m: give it in m, 0.033 for 33 mm",
+        Specimen,
+        33.0,
+        (6.0, 3.0),
+    )
+    refuses(
+        InputError, "section of a specimen is 3 m: give it in m, 0.003", Specimen, 0.033, (6.0, 3.0)
+    )
 
 
 def test_public_tests_lose_nothing(shared_data):

@@ -1,4 +1,6 @@
-"""Nonlinear least squares, whose problems do not see each other, and conjugate gradients of a batch."""
+"""Nonlinear least squares, whose problems do not see each other,
+and conjugate gradients of a batch.
+"""
 
 import numpy as np
 import pytest
@@ -27,18 +29,27 @@ class Valley:
         if x[0] < self.wall:
             return np.inf, np.zeros(2), np.zeros((2, 2))
         r = np.array([100.0 * (x[1] - x[0] ** 2), x[0] - 0.7])
-        return squares(r, np.array([[-200.0 * x[0], 100.0], [1.0, 0.0]]) if derivatives else np.full((2, 2), np.nan))
+        return squares(
+            r,
+            np.array([[-200.0 * x[0], 100.0], [1.0, 0.0]])
+            if derivatives
+            else np.full((2, 2), np.nan),
+        )
 
 
 def descend(valley, start, max_iterations):
     problem = UnitBox(valley)
-    point = minimise(problem, problem.evaluate(torch.tensor([start], dtype=torch.float64)), 1e-6, max_iterations).point
+    point = minimise(
+        problem, problem.evaluate(torch.tensor([start], dtype=torch.float64)), 1e-6, max_iterations
+    ).point
     return point.x[0].numpy(), float(point.value)
 
 
 @pytest.mark.parametrize("start", [[0.05, 0.9], [0.95, 0.9]])
 def test_the_descent_follows_a_bent_valley(start):
-    """Without a second step after a rejected one, two of these are not there after a hundred evaluations."""
+    """Without a second step after a rejected one, two of these are not there
+    after a hundred evaluations.
+    """
     valley = Valley()
     x, value = descend(valley, start, 50)
     np.testing.assert_allclose(x, [0.7, 0.49], atol=1e-6)
@@ -47,11 +58,15 @@ def test_the_descent_follows_a_bent_valley(start):
 
 
 def test_the_descent_does_not_walk_to_and_fro_and_turns_back_from_failures():
-    """Full steps go from one side of the minimum to the other and back, each as long as the trust box allows."""
+    """Full steps go from one side of the minimum to the other and back,
+    each as long as the trust box allows.
+    """
 
     def objective(x, derivatives):
         t = 40.0 * (x[0] - 0.5)
-        return squares(np.array([np.arctan(t), 0.3 * (x[1] - 0.4)]), np.diag([40.0 / (1.0 + t * t), 0.3]))
+        return squares(
+            np.array([np.arctan(t), 0.3 * (x[1] - 0.4)]), np.diag([40.0 / (1.0 + t * t), 0.3])
+        )
 
     x, _ = descend(objective, [0.38, 0.9], 30)
     np.testing.assert_allclose(x, [0.5, 0.4], atol=1e-5)
@@ -72,7 +87,8 @@ def test_a_linear_function_needs_two_evaluations():
     point = minimise(problem, problem.evaluate(torch.tensor([[0.5, 0.5]]).double()), 1e-6, 40).point
     best = np.array([0.45, 0.52]) + np.linalg.lstsq(matrix, [-0.1, -0.1, 0.12], rcond=None)[0]
     np.testing.assert_allclose(point.x[0], best, atol=1e-6)
-    assert evaluated == [False, True, False, True]  # The step after the second derivatives is not evaluated.
+    # The step after the second derivatives is not evaluated.
+    assert evaluated == [False, True, False, True]
     assert float(point.value) == pytest.approx(objective(best, False)[0], rel=1e-6)
     assert len(steps) == 3
     assert steps[-1] == (point.x[0].tolist(), float(point.value))
@@ -83,7 +99,11 @@ def test_a_search_ends_where_there_are_no_derivatives(limit, differentiates):
     valley = Valley()
 
     def objective(x, derivatives):
-        return (np.inf, np.zeros(2), np.zeros((2, 2))) if derivatives and x[0] > limit else valley(x, derivatives)
+        return (
+            (np.inf, np.zeros(2), np.zeros((2, 2)))
+            if derivatives and x[0] > limit
+            else valley(x, derivatives)
+        )
 
     problem = UnitBox(objective)
     start = problem.evaluate(torch.tensor([[0.1, 0.9]]).double())
@@ -109,7 +129,9 @@ class Rosenbrock(Problem):
     def linearise(self, point):
         (x,), (r,) = (point.x,), point.kept
         zero = torch.zeros_like(x[:, 0])
-        j = torch.stack([torch.stack([-20.0 * x[:, 0], zero + 10.0], 1), torch.stack([zero - 1.0, zero], 1)], 1)
+        j = torch.stack(
+            [torch.stack([-20.0 * x[:, 0], zero + 10.0], 1), torch.stack([zero - 1.0, zero], 1)], 1
+        )
         gradient = (j.mT @ r[..., None])[..., 0]
         return lambda damping: x - torch.linalg.solve(damped(j.mT @ j, damping), gradient)
 
@@ -193,7 +215,9 @@ def test_it_stops_at_the_tolerance():
     conjugate_gradients(operator, torch.clone, right, tolerance=0.0, max_iterations=4)
     assert len(calls) == 5
     largest = float(right.abs().max())
-    assert conjugate_gradients(operator, torch.clone, right, tolerance=0.0, shortest=largest).converged.all()
+    assert conjugate_gradients(
+        operator, torch.clone, right, tolerance=0.0, shortest=largest
+    ).converged.all()
     assert len(calls) == 5
     conjugate_gradients(operator, exact, right, tolerance=0.0, shortest=1e-6)
     assert len(calls) == 6

@@ -1,4 +1,7 @@
-"""Every layout factorises the same batch of symmetric matrices; the layout that `auto` takes; dense couplings."""
+"""Every layout factorises the same batch of symmetric matrices; the layout that `auto` takes.
+
+Dense couplings.
+"""
 
 import os
 import sys
@@ -22,8 +25,12 @@ NODES, BATCH, HUB = 16, 3, 5
 
 
 def pattern():
-    """A ring with a few chords and a node that couples to all: its given order has full bandwidth."""
-    pairs = {(i, i) for i in range(NODES)} | {(max(i, (i + 1) % NODES), min(i, (i + 1) % NODES)) for i in range(NODES)}
+    """A ring with a few chords and a node that couples to all:
+    its given order has full bandwidth.
+    """
+    pairs = {(i, i) for i in range(NODES)} | {
+        (max(i, (i + 1) % NODES), min(i, (i + 1) % NODES)) for i in range(NODES)
+    }
     pairs |= {(max(i, HUB), min(i, HUB)) for i in range(NODES)}
     rows, cols = np.array(sorted(pairs | {(7, 2), (9, 4)})).T
     return rows, cols
@@ -62,7 +69,9 @@ def factorised(solver, dense):
 
 def make(kind, block, device="cpu", dtype=torch.float64):
     where = *pattern(), NODES, block, torch.device(device), dtype
-    return {"banded": BandedSolver, "bordered": BorderedSolver}.get(kind, partial(make_linear_solver, kind))(*where)
+    return {"banded": BandedSolver, "bordered": BorderedSolver}.get(
+        kind, partial(make_linear_solver, kind)
+    )(*where)
 
 
 def layouts(device):
@@ -88,7 +97,9 @@ def test_solutions_equal_numpy(block, definite, device, cholespy):
         factor = factorised(solver, dense)
         assert not factor.failed.any()
         solution = factor.solve(torch.as_tensor(right, device=device))
-        np.testing.assert_allclose(solution.cpu(), np.linalg.solve(dense, right), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            solution.cpu(), np.linalg.solve(dense, right), rtol=1e-9, atol=1e-9
+        )
 
 
 def test_idle_matrices_leave_the_others_as_they_are(device, cholespy):
@@ -102,22 +113,29 @@ def test_idle_matrices_leave_the_others_as_they_are(device, cholespy):
         factor = solver.factor(values_of(solver, dense), idle=idle)
         assert not factor.failed[[0, 2]].any()
         solution = factor.solve(right).cpu()[[0, 2]]
-        np.testing.assert_allclose(solution, np.linalg.solve(dense[[0, 2]], right.cpu()[[0, 2]]), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            solution, np.linalg.solve(dense[[0, 2]], right.cpu()[[0, 2]]), rtol=1e-9, atol=1e-9
+        )
 
 
 def test_idle_matrices_keep_the_factor_they_have(device, cholespy):
     dense, others = matrices(3, 20.0), matrices(3, 20.0, seed=7)
     idle = torch.tensor([False, True, True], device=device)
     right = torch.ones(BATCH, NODES * 3, 2, dtype=torch.float64, device=device)
-    columns = torch.as_tensor(0.3 * np.random.default_rng(0).normal(size=(BATCH, NODES * 3, 2)), device=device)
+    columns = torch.as_tensor(
+        0.3 * np.random.default_rng(0).normal(size=(BATCH, NODES * 3, 2)), device=device
+    )
     for kind in layouts(device):
         for extra in (None, columns):
             solver = make(kind, 3, device)
             values = values_of(solver, dense)
             before = solver.factor(values, columns=extra)
-            # As the assembly does: what is idle stays, as a matrix or as the factor that overwrote it.
+            # As the assembly does: what is idle stays, as a matrix or as the factor that overwrote
+            # it.
             values[0] = values_of(solver, others)[0]
-            after = solver.factor(values, columns=None if extra is None else 2.0 * extra, idle=idle, before=before)
+            after = solver.factor(
+                values, columns=None if extra is None else 2.0 * extra, idle=idle, before=before
+            )
             assert not after.failed.any()
             expected = dense.copy()
             expected[0] = others[0]
@@ -125,10 +143,14 @@ def test_idle_matrices_keep_the_factor_they_have(device, cholespy):
                 scale = np.array([2.0, 1.0, 1.0])[:, None, None] * extra.cpu().numpy()
                 expected = expected + scale @ scale.transpose(0, 2, 1)
             solution = after.solve(right).cpu()
-            np.testing.assert_allclose(solution, np.linalg.solve(expected, right.cpu()), rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(
+                solution, np.linalg.solve(expected, right.cpu()), rtol=1e-9, atol=1e-9
+            )
             in_place = right[:, solver.dofs, 0].contiguous()
             after.solve_in_place(in_place)
-            np.testing.assert_allclose(in_place.cpu(), solution[:, solver.dofs.cpu(), 0], rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(
+                in_place.cpu(), solution[:, solver.dofs.cpu(), 0], rtol=1e-9, atol=1e-12
+            )
 
 
 @pytest.mark.parametrize("unknown", [0, 16, 35])
@@ -143,7 +165,9 @@ def test_a_pivot_that_is_not_positive_is_found_wherever_it_is(unknown, device, c
         assert solver.factor(values_of(solver, bad)).failed.tolist() == [False, True, False]
 
 
-def test_only_a_solver_that_says_so_writes_over_the_values_and_nan_stays_or_counts_as_failed(device):
+def test_only_a_solver_that_says_so_writes_over_the_values_and_nan_stays_or_counts_as_failed(
+    device,
+):
     for kind in layouts(device):
         solver = make(kind, 3, device)
         values = values_of(solver, matrices(3, 20.0))
@@ -167,20 +191,26 @@ def test_indefinite_matrices_in_float32(device, cholespy):
         solver = make(kind, 3, device, torch.float32)
         solution = factorised(solver, dense).solve(right)
         expected = np.linalg.solve(dense, right.cpu().numpy())
-        np.testing.assert_allclose(solution.cpu().numpy(), expected, rtol=0, atol=1e-3 * np.abs(expected).max())
+        np.testing.assert_allclose(
+            solution.cpu().numpy(), expected, rtol=0, atol=1e-3 * np.abs(expected).max()
+        )
 
 
 def test_a_correction_of_low_rank_is_as_accurate_in_place(device):
     """Even for the right-hand sides that it changes most."""
     dense = matrices(3, 20.0)
-    columns = torch.as_tensor(1e3 * np.random.default_rng(0).normal(size=(BATCH, NODES * 3, 1)), device=device)
+    columns = torch.as_tensor(
+        1e3 * np.random.default_rng(0).normal(size=(BATCH, NODES * 3, 1)), device=device
+    )
     expected = np.linalg.solve(dense + (columns @ columns.mT).cpu().numpy(), columns.cpu().numpy())
     for kind in layouts(device):
         solver = make(kind, 3, device)
         in_place = columns[:, solver.dofs, 0].contiguous()
         solver.factor(values_of(solver, dense), columns=columns).solve_in_place(in_place)
         reference = expected[:, solver.dofs.cpu().numpy(), 0]
-        np.testing.assert_allclose(in_place.cpu(), reference, rtol=0, atol=1e-6 * np.abs(reference).max())
+        np.testing.assert_allclose(
+            in_place.cpu(), reference, rtol=0, atol=1e-6 * np.abs(reference).max()
+        )
 
 
 def test_band_is_as_narrow_as_the_order_allows():
@@ -193,7 +223,9 @@ def test_band_is_as_narrow_as_the_order_allows():
 
 
 def test_an_indefinite_arrow_may_have_a_singular_band():
-    """Both unknowns that couple to the hub alone have no stiffness of their own: only pivoting solves this."""
+    """Both unknowns that couple to the hub alone have no stiffness of their own:
+    only pivoting solves this.
+    """
     n = 30
     rows, cols = np.array(sorted({(i, i) for i in range(n)} | {(i, 0) for i in range(n)})).T
     solver = BorderedSolver(rows, cols, n, 1, torch.device("cpu"), torch.float64)
@@ -214,7 +246,10 @@ def test_an_indefinite_arrow_may_have_a_singular_band():
 
 
 def test_an_indefinite_matrix_prints_nothing(capfd):
-    """CHOLMOD warns by C of a matrix that is not positive definite; other output of the process is kept."""
+    """CHOLMOD warns by C of a matrix that is not positive definite.
+
+    Other output of the process is kept.
+    """
     pytest.importorskip("cholespy")
     solver = SparseSolver(np.array([0]), np.array([0]), 1, 3, torch.device("cpu"), torch.float64)
     values = torch.zeros(1, solver.n_values, dtype=torch.float64)
@@ -236,16 +271,24 @@ def chain(count):
 
 
 def test_few_hubs_of_a_narrow_band_come_last_and_many_of_a_wide_one_do_not():
-    """A node that couples to a whole chain, and seven with far more neighbours than the others of a wide band."""
+    """A node that couples to a whole chain, and seven
+    with far more neighbours than the others of a wide band.
+    """
     rows, cols = chain(400)
     rows, cols = np.append(rows, np.full(399, 399)), np.append(cols, np.arange(399))
-    assert isinstance(make_linear_solver("auto", rows, cols, 400, 3, CPU, torch.float64), BorderedSolver)
+    assert isinstance(
+        make_linear_solver("auto", rows, cols, 400, 3, CPU, torch.float64), BorderedSolver
+    )
     count, reach, many = 600, 80, np.arange(150, 500, 55)
-    pairs = {(i, i) for i in range(count)} | {(i, j) for i in range(count) for j in range(max(i - reach, 0), i, 16)}
+    pairs = {(i, i) for i in range(count)} | {
+        (i, j) for i in range(count) for j in range(max(i - reach, 0), i, 16)
+    }
     pairs |= {(max(i, j), min(i, j)) for i in many for j in range(i - 120, min(i + 120, count), 2)}
     rows, cols = np.array(sorted(pairs)).T
     assert len(hubs(rows, cols, count)) >= len(many)
-    assert isinstance(make_linear_solver("auto", rows, cols, count, 3, CPU, torch.float64), BandedSolver)
+    assert isinstance(
+        make_linear_solver("auto", rows, cols, count, 3, CPU, torch.float64), BandedSolver
+    )
 
 
 def test_compact_bodies_take_pardiso_where_it_is_installed_and_bad_choices_are_refused(monkeypatch):
@@ -261,7 +304,17 @@ def test_compact_bodies_take_pardiso_where_it_is_installed_and_bad_choices_are_r
     monkeypatch.setattr("warp_resphys.linalg.choice.MAX_BANDED_FLOPS", 1e9)
     assert isinstance(make_linear_solver("auto", *body), SparseSolver)
     refuses(InputError, "pip install mkl", make_linear_solver, "pardiso", *body)
-    refuses(InputError, "linear_solver is 'lu'", make_linear_solver, "lu", *chain(3), 3, 3, CPU, torch.float64)
+    refuses(
+        InputError,
+        "linear_solver is 'lu'",
+        make_linear_solver,
+        "lu",
+        *chain(3),
+        3,
+        3,
+        CPU,
+        torch.float64,
+    )
     with pytest.raises(InputError, match="linear_solver=pardiso runs on the CPU alone"):
         make_linear_solver("pardiso", *chain(3), 3, 3, torch.device("cuda"), torch.float64)
 
@@ -279,21 +332,29 @@ class DenseFactor(Factor):
 
 @pytest.mark.parametrize("name", ["banded", "tiled", "dense", "sparse"])
 def test_columns_of_inverses(name):
-    """Of a matrix of two blocks that are not coupled, in two environments, beside those of the dense inverse."""
+    """Of a matrix of two blocks that are not coupled,
+    in two environments, beside those of the dense inverse.
+    """
     random = np.random.default_rng(1)
     rows = np.concatenate([np.arange(5), np.arange(1, 3), np.array([4])])
     cols = np.concatenate([np.arange(5), np.arange(2), np.array([3])])
     solver = make_linear_solver(name, rows, cols, 5, 3, CPU, torch.float64)
-    pattern = np.kron(scipy.sparse.coo_array((np.ones(len(rows)), (rows, cols))).toarray(), np.ones((3, 3)))
+    pattern = np.kron(
+        scipy.sparse.coo_array((np.ones(len(rows)), (rows, cols))).toarray(), np.ones((3, 3))
+    )
     pattern = (pattern + pattern.T) > 0
-    matrices = np.stack([np.where(pattern, symmetric(random, 15, True), 0.0) + 30.0 * np.eye(15) for _ in range(2)])
+    matrices = np.stack(
+        [np.where(pattern, symmetric(random, 15, True), 0.0) + 30.0 * np.eye(15) for _ in range(2)]
+    )
     values = torch.zeros(2, solver.n_values, dtype=torch.float64)
     for e, (i, j) in enumerate(zip(rows, cols, strict=True)):
         block = matrices[:, 3 * i : 3 * i + 3, 3 * j : 3 * j + 3].reshape(2, 9)
         stored = solver.address[e] >= 0
         values[:, solver.address[e][stored]] = torch.tensor(block[:, stored])
     environments, unknowns = torch.tensor([0, 0, 1, 1, 1]), torch.tensor([2, 14, 0, 9, 13])
-    actual = solver.factor(values).inverse_columns(environments, unknowns, values.new_zeros(2, 0, 15))
+    actual = solver.factor(values).inverse_columns(
+        environments, unknowns, values.new_zeros(2, 0, 15)
+    )
     expected = np.linalg.inv(matrices)[environments, unknowns]
     np.testing.assert_allclose(actual.numpy(), expected, rtol=0.0, atol=1e-12)
 
@@ -304,7 +365,9 @@ def symmetric(random, size, definite):
 
 
 def test_solutions_are_those_of_the_whole_matrix_and_columns_are_kept():
-    """Two environments with other unknowns, one of them with room for more, and an order of unknowns of its own."""
+    """Two environments with other unknowns, one of them with room for more,
+    and an order of unknowns of its own.
+    """
     random, n = np.random.default_rng(0), 12
     matrices = torch.tensor(np.stack([symmetric(random, n, True) for _ in range(3)]))
     factor, solver = DenseFactor(matrices), CouplingSolver(3, n, matrices)
@@ -327,5 +390,7 @@ def test_solutions_are_those_of_the_whole_matrix_and_columns_are_kept():
         assert corrected(couplings).numpy() == pytest.approx(expected.numpy(), rel=1e-10, abs=1e-12)
     assert factor.count == 3 + 1  # 1, 4, 7 beside 0, 2; then 11 beside 5
     solver.forget(torch.tensor([True, False, False]))
-    corrected([Coupling(torch.tensor([0]), torch.tensor([[4]]), torch.ones(1, 1, 1, dtype=torch.float64))])
+    corrected(
+        [Coupling(torch.tensor([0]), torch.tensor([[4]]), torch.ones(1, 1, 1, dtype=torch.float64))]
+    )
     assert factor.count == 5

@@ -10,7 +10,9 @@ import torch
 from warp_resphys.linalg.linear_solver import Factor
 from warp_resphys.linalg.pardiso import PardisoSolver, has_pardiso
 
-pytestmark = pytest.mark.skipif(not has_pardiso(), reason="needs the package mkl, which x86 processors alone have")
+pytestmark = pytest.mark.skipif(
+    not has_pardiso(), reason="needs the package mkl, which x86 processors alone have"
+)
 
 NODES = 40
 ROWS, COLS = np.tril_indices(NODES)
@@ -41,14 +43,20 @@ def solutions(factor: Factor):
     return factor.solve(RIGHT)[0].numpy()
 
 
-def test_a_direction_is_accurate_to_single_precision_and_solutions_and_low_rank_terms_to_double(solver):
+def test_a_direction_is_accurate_to_single_precision_and_solutions_and_low_rank_terms_to_double(
+    solver,
+):
     dense, values = matrix(0)
     exact = np.linalg.solve(dense, RIGHT[0].numpy())
     np.testing.assert_allclose(solutions(solver.factor(values)), exact, rtol=1e-9, atol=1e-12)
     for kind in (torch.float64, torch.float32):
         direction = RIGHT[:, :, 0].to(kind, copy=True)
         solver.direction_factor(values).solve_in_place(direction)
-        assert 1e-10 < np.abs(direction[0].double().numpy() - exact[:, 0]).max() < 1e-5 * np.abs(exact).max()
+        assert (
+            1e-10
+            < np.abs(direction[0].double().numpy() - exact[:, 0]).max()
+            < 1e-5 * np.abs(exact).max()
+        )
     dense, values = matrix(0)
     columns = 1e3 * torch.as_tensor(np.random.default_rng(6).normal(size=(1, NODES, 2)))
     whole = dense + (columns @ columns.mT)[0].numpy()
@@ -58,7 +66,9 @@ def test_a_direction_is_accurate_to_single_precision_and_solutions_and_low_rank_
     np.testing.assert_allclose(direction[0].numpy(), exact, atol=1e-7 * np.abs(exact).max())
 
 
-def test_a_matrix_that_is_indefinite_in_single_precision_has_a_direction_and_a_singular_one_none(solver):
+def test_a_matrix_that_is_indefinite_in_single_precision_has_a_direction_and_a_singular_one_none(
+    solver,
+):
     turn = np.linalg.qr(matrix(2)[0])[0]
     dense = turn @ np.diag(np.logspace(-10, 0, NODES)) @ turn.T
     values = stored(dense)
@@ -83,7 +93,9 @@ def test_memory_is_given_back_with_the_solver(monkeypatch):
     factor = solver.factor(matrix(0)[1].float())
     phases, room = [], type(next(iter(solver._rooms.values())))
     call = room.call
-    monkeypatch.setattr(room, "call", lambda self, phase, *rest: phases.append(phase) or call(self, phase, *rest))
+    monkeypatch.setattr(
+        room, "call", lambda self, phase, *rest: phases.append(phase) or call(self, phase, *rest)
+    )
     del factor, solver
     gc.collect()
     assert phases == [-1]
@@ -94,7 +106,9 @@ def test_torch_may_change_its_number_of_threads():
     n, width = 1200, 400
     rows, cols = (index[np.subtract(*np.tril_indices(n)) <= width] for index in np.tril_indices(n))
     solver = PardisoSolver(rows, cols, n, 1, torch.device("cpu"), torch.float64)
-    random, right, before = np.random.default_rng(5), torch.ones(1, n, 1, dtype=torch.float64), torch.get_num_threads()
+    random = np.random.default_rng(5)
+    right = torch.ones(1, n, 1, dtype=torch.float64)
+    before = torch.get_num_threads()
     try:
         for threads in (2, *[1] * 8):
             torch.set_num_threads(threads)

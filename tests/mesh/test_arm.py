@@ -35,7 +35,10 @@ SHAPES = [
 
 
 def volume(mesh, faces):
-    """Of what a surface encloses; negative where its faces are counter-clockwise seen from within."""
+    """Of what a surface encloses.
+
+    Negative where its faces are counter-clockwise seen from within.
+    """
     return np.linalg.det(mesh.vertices[face_triangles(faces)]).sum() / 6.0
 
 
@@ -47,8 +50,11 @@ def sopra_chambers():
 
 
 def sopra_silicone():
-    """Volume of the solid: three lobes of 4 mm more than the half discs, that meet 30 degrees behind their centres."""
-    sizes, share = np.array([[0.0283923, 0.014], [0.0212942, 0.0095], [0.0165622, 0.0065]]), np.linspace(0.0, 1.0, 2001)
+    """Volume of the solid: three lobes of 4 mm more than the half discs,
+    that meet 30 degrees behind their centres.
+    """
+    sizes = np.array([[0.0283923, 0.014], [0.0212942, 0.0095], [0.0165622, 0.0065]])
+    share = np.linspace(0.0, 1.0, 2001)
     total = sum(cap * lobes(*ends) for cap, ends in zip((0.010, 0.021, 0.005), sizes, strict=True))
     for low, high in itertools.pairwise(sizes):
         total += 0.120 * trapezoid([lobes(*(low + t * (high - low))) for t in share], share)
@@ -56,7 +62,9 @@ def sopra_silicone():
 
 
 def lobes(radius, inner):
-    """Area inside three circles of a radius of 4 mm more than the half discs', by polar integration."""
+    """Area inside three circles of a radius of 4 mm more
+    than the half discs', by polar integration.
+    """
     outer = inner + 0.004
     angle = np.linspace(-pi / 3.0, pi / 3.0, 2001)
     d = radius - outer
@@ -74,7 +82,9 @@ def area(polygon):
     return 0.5 * (polygon.conj() * np.roll(polygon, -1, axis=-1)).imag.sum(-1)
 
 
-@pytest.mark.parametrize(("cells", "size"), [("hexahedra", 0.01), ("hexahedra", 0.002), ("tetrahedra", 0.03)])
+@pytest.mark.parametrize(
+    ("cells", "size"), [("hexahedra", 0.01), ("hexahedra", 0.002), ("tetrahedra", 0.03)]
+)
 def test_sopra_has_its_chambers_and_its_silicone_at_every_size(cells, size):
     if cells == "tetrahedra":
         pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
@@ -92,7 +102,9 @@ def test_polygons_have_the_areas_of_the_curves_and_converge_to_them(profile, out
     section = section_of(arm, 0.025)
     fine = [area(polygon) for polygon in polygons(section, 1e-4)]
     for size, most in ((1.0, 0.16), (0.002, 0.012), (0.0005, 8e-4)):
-        np.testing.assert_allclose([area(polygon) for polygon in polygons(section, size)], fine, rtol=1e-12)
+        np.testing.assert_allclose(
+            [area(polygon) for polygon in polygons(section, size)], fine, rtol=1e-12
+        )
         assert all(0.0 < growth < most for growth in section.growth(section.divisions(size)))
 
 
@@ -107,18 +119,34 @@ def test_quadrilaterals_fill_the_solid_and_each_chamber_once(profile, outline, c
     areas = [area(points[corners[:, [0, 1, 1, 0], [0, 0, 1, 1]]]) for corners in quads]
     assert min(own.min() for own in areas) > 0.0
     for chamber in range(section.count):
-        own = sum(part.sum() for part, number in zip(areas, chambers, strict=True) if number == chamber)
+        own = sum(
+            part.sum() for part, number in zip(areas, chambers, strict=True) if number == chamber
+        )
         assert own == pytest.approx(area(section.chamber_polygon(divisions)), rel=1e-9)
     assert set(chambers) == {SOLID, *range(section.count)}
-    assert sum(part.sum() for part in areas) == pytest.approx(area(section.body_polygon(divisions)), rel=1e-9)
+    assert sum(part.sum() for part in areas) == pytest.approx(
+        area(section.body_polygon(divisions)), rel=1e-9
+    )
 
 
 @pytest.mark.parametrize(
-    ("profile", "outline", "count", "size"), [*((*shape, 0.01) for shape in SHAPES), (*SHAPES[0], 0.0025)]
+    ("profile", "outline", "count", "size"),
+    [*((*shape, 0.01) for shape in SHAPES), (*SHAPES[0], 0.0025)],
 )
 def test_walls_and_webs_are_as_thick_as_asked(profile, outline, count, size):
-    shape = {"chambers": count, "profile": profile, "outline": outline, "wall": 0.003, "web": 0.0025}
-    along = {"chamber_lengths": (0.1,), "caps": (0.01, 0.01), "radii": (0.025, 0.025), "layers": 0.03}
+    shape = {
+        "chambers": count,
+        "profile": profile,
+        "outline": outline,
+        "wall": 0.003,
+        "web": 0.0025,
+    }
+    along = {
+        "chamber_lengths": (0.1,),
+        "caps": (0.01, 0.01),
+        "radii": (0.025, 0.025),
+        "layers": 0.03,
+    }
     mesh, surfaces = mesh_arm(ArmMesh(size=size, **shape, **along))
     check_mesh(mesh)
     assert scaled_jacobian(mesh).min() > (0.18 if profile == "disc" else 0.2)
@@ -126,26 +154,44 @@ def test_walls_and_webs_are_as_thick_as_asked(profile, outline, count, size):
     first = np.unique(surfaces["chamber_1"])
     across = mesh.vertices[first, :2] @ [np.sin(pi / count), -np.cos(pi / count)]
     if profile != "disc":  # corners are kept
-        assert across.min() == pytest.approx(0.5 * 0.0025, abs=1e-9)  # the middle of the web is at 0
+        # The middle of the web is at 0.
+        assert across.min() == pytest.approx(0.5 * 0.0025, abs=1e-9)
     wall = mesh.vertices[:, 0].max() - mesh.vertices[first, 0].max()
     assert wall == pytest.approx(0.003, abs=1e-3 if size > 0.005 else 1e-4)
 
 
 WALLS = ArmMesh(
-    **{"chamber_lengths": (0.08,), "caps": (0.01, 0.01), "radii": (0.022, 0.022), "outline": "round", "chambers": 4},
-    **{"profile": "wedge", "wall": 0.002, "web": 0.002, "core": 0.009, "bore": 0.007, "layers": 0.03},
+    **{
+        "chamber_lengths": (0.08,),
+        "caps": (0.01, 0.01),
+        "radii": (0.022, 0.022),
+        "outline": "round",
+        "chambers": 4,
+    },
+    **{
+        "profile": "wedge",
+        "wall": 0.002,
+        "web": 0.002,
+        "core": 0.009,
+        "bore": 0.007,
+        "layers": 0.03,
+    },
 )
 
 
 @pytest.mark.parametrize("nodes", [8, 20, 27])
 def test_a_bore_and_flat_inner_walls(nodes):
-    """The silicone between a circle and a square hole, less four wedges between webs, with single quadratic cells."""
+    """The silicone between a circle and a square hole,
+    less four wedges between webs, with single quadratic cells.
+    """
     mesh, surfaces = mesh_arm(WALLS.changed(nodes=nodes))
     check_mesh(mesh)
     half = pi / 4 - np.arcsin(0.001 / 0.020)
     corner = np.array([0.009, 0.009 - 0.001 * np.sqrt(2.0)])
     end = 0.020 * np.array([np.cos(half), np.sin(half)])
-    wedge = 0.020**2 * half + (corner[0] * end[1] - corner[1] * end[0]) * -1.0 - corner[0] * corner[1]
+    wedge = (
+        0.020**2 * half + (corner[0] * end[1] - corner[1] * end[0]) * -1.0 - corner[0] * corner[1]
+    )
     solid = 0.1 * (pi * 0.022**2 - 4.0 * 0.007**2) - 4.0 * 0.08 * wedge
     if nodes == 27:  # the nodes lie on the curves
         assert cell_volumes(mesh).sum() == pytest.approx(solid, rel=2e-3)
@@ -155,7 +201,9 @@ def test_a_bore_and_flat_inner_walls(nodes):
     assert len(outside.faces) == len(surfaces["outside"]) // 2  # the other half bounds the bore
     radii = np.linalg.norm(mesh.vertices[np.unique(outside.faces), :2], axis=1)
     assert radii.min() == pytest.approx(0.022, rel=1e-9 if nodes > 8 else 0.06)
-    assert [len(chamber.faces) for chamber in find_chambers(mesh)] == [len(surfaces["chamber_1"])] * 4
+    assert [len(chamber.faces) for chamber in find_chambers(mesh)] == [
+        len(surfaces["chamber_1"])
+    ] * 4
 
 
 @pytest.mark.parametrize("cells", ["hexahedra", "tetrahedra"])
@@ -202,9 +250,15 @@ def test_without_gmsh_one_sentence(monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"chamber_lengths": ()}, "chamber_lengths is (): it must be a list of one or more positive numbers, in m"),
+        (
+            {"chamber_lengths": ()},
+            "chamber_lengths is (): it must be a list of one or more positive numbers, in m",
+        ),
         ({"caps": (0.01, 0.01)}, "caps has 2 numbers, but 2 chamber_lengths need 3"),
-        ({"radii": (0.028, -0.02, 0.016)}, "radii is (0.028, -0.02, 0.016): it must be a list of one or more positive"),
+        (
+            {"radii": (0.028, -0.02, 0.016)},
+            "radii is (0.028, -0.02, 0.016): it must be a list of one or more positive",
+        ),
         ({"wall": float("nan")}, "wall is nan"),
         ({"chambers": 1}, "chambers is 1: it must be a whole number from 2 to 8"),
         ({"profile": "square"}, "profile is 'square'"),
@@ -223,29 +277,43 @@ def test_without_gmsh_one_sentence(monkeypatch):
         ({"profile": "wedge"}, "outline is lobed, which does not go with wedges"),
         ({"bore": 0.005}, "bore is set, but profile is half_disc"),
         ({"profile": "wedge", "outline": "round", "bore": 0.02}, "a bore of 20 mm does not fit"),
-        ({"profile": "wedge", "outline": "round", "core": 0.009, "bore": 0.0085}, "a bore of 8.5 mm does not fit"),
+        (
+            {"profile": "wedge", "outline": "round", "core": 0.009, "bore": 0.0085},
+            "a bore of 8.5 mm does not fit",
+        ),
         ({"profile": "wedge", "outline": "round", "core": 0.02}, "3 chambers do not fit"),
-        ({"profile": "wedge", "outline": "round", "chambers": 2}, "chambers is 2, but wedges have flat sides"),
+        (
+            {"profile": "wedge", "outline": "round", "chambers": 2},
+            "chambers is 2, but wedges have flat sides",
+        ),
     ],
 )
 def test_measures_that_make_no_arm(changes, message):
     refuses(InputError, re.escape(message), lambda: mesh_arm(ArmMesh(**changes)))
 
 
-@pytest.mark.parametrize(("option", "count"), [("arm_coarse", 530), ("arm", 1373), ("arm_fine", 1950)])
+@pytest.mark.parametrize(
+    ("option", "count"), [("arm_coarse", 530), ("arm", 1373), ("arm_fine", 1950)]
+)
 def test_shipped_arms(option, count):
     mesh = build_mesh(settings(f"mesh={option}").mesh)
     assert len(mesh.vertices) == count
     chambers = find_chambers(mesh)
     assert len(chambers) == 6
     check_chambers(chambers, mesh)
-    np.testing.assert_allclose([-volume(mesh, chamber.faces) for chamber in chambers], sopra_chambers(), rtol=1e-5)
+    np.testing.assert_allclose(
+        [-volume(mesh, chamber.faces) for chamber in chambers], sopra_chambers(), rtol=1e-5
+    )
 
 
 @pytest.mark.slow
 def test_shipped_arms_come_from_the_commands_beside_them(tmp_path):
-    rows = re.findall(r"mesh\.size=(\S+) mesh\.layers=(\S+) save=(\S+)`", (SHIPPED / "README.md").read_text())
-    assert {name for _, _, name in rows} == {path.name for path in SHIPPED.iterdir() if path.name.endswith(".msh")}
+    rows = re.findall(
+        r"mesh\.size=(\S+) mesh\.layers=(\S+) save=(\S+)`", (SHIPPED / "README.md").read_text()
+    )
+    assert {name for _, _, name in rows} == {
+        path.name for path in SHIPPED.iterdir() if path.name.endswith(".msh")
+    }
     for size, layers, name in rows:
         mesh, surfaces = mesh_arm(ArmMesh(size=float(size), layers=float(layers)))
         with resources.as_file(SHIPPED / name) as path:

@@ -15,7 +15,12 @@ from warp_resphys import InputError, Mesh, MeshError, quadratic, read_mesh, sele
 from warp_resphys.io import decoding
 from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra, boxes_hexahedra
 from warp_resphys.mesh.quality import cell_volumes
-from warp_resphys.mesh.volume_mesh import boundary_faces, boundary_triangles, check_mesh, surface_vertices
+from warp_resphys.mesh.volume_mesh import (
+    boundary_faces,
+    boundary_triangles,
+    check_mesh,
+    surface_vertices,
+)
 
 BOXES = {
     "hexahedron": box_hexahedra,
@@ -25,7 +30,13 @@ BOXES = {
     "hexahedron27": partial(box_hexahedra, nodes=27),
 }
 PER_METRE = {"m": 1, "cm": 100, "mm": 1000}
-TRIANGLES_PER_BRICK_SIDE = {"hexahedron": 2, "tetrahedron": 2, "tetrahedron10": 8, "hexahedron20": 6, "hexahedron27": 8}
+TRIANGLES_PER_BRICK_SIDE = {
+    "hexahedron": 2,
+    "tetrahedron": 2,
+    "tetrahedron10": 8,
+    "hexahedron20": 6,
+    "hexahedron27": 8,
+}
 
 
 def enclosed_volume(mesh):
@@ -44,7 +55,9 @@ def is_closed(triangles):
 def write(path, mesh, *blocks, units="m"):
     cells = [*blocks, (mesh.element.file_type, mesh.cells)]
     file_format = "gmsh" if path.suffix == ".msh" else None  # not ANSYS
-    meshio.write(path, meshio.Mesh(mesh.vertices * PER_METRE[units], cells), file_format=file_format)
+    meshio.write(
+        path, meshio.Mesh(mesh.vertices * PER_METRE[units], cells), file_format=file_format
+    )
     return path
 
 
@@ -97,11 +110,9 @@ def test_any_box_is_valid_closed_and_outward(kind, size, divisions):
     assert len(surface_vertices(mesh)) == np.prod(points + 1) - np.prod(points - 1)
 
 
-PLATE, SIDES, FIN = (
-    ((-0.005, -0.025, 0.0), (0.005, 0.025, 0.06)),
-    ((-0.015, -0.015, 0.0), (0.015, 0.015, 0.06)),
-    ((-0.005, -0.015, 0.06), (0.005, 0.015, 0.08)),
-)
+PLATE = ((-0.005, -0.025, 0.0), (0.005, 0.025, 0.06))
+SIDES = ((-0.015, -0.015, 0.0), (0.015, 0.015, 0.06))
+FIN = ((-0.005, -0.015, 0.06), (0.005, 0.015, 0.08))
 
 
 @pytest.mark.parametrize(("size", "nodes"), [(0.007, 8), (0.015, 20), (0.015, 27)])
@@ -111,7 +122,10 @@ def test_a_cross_with_a_fin_is_filled_without_cracks(size, nodes):
     assert mesh.element.nodes == nodes
     section = 0.01 * 0.05 + 2 * 0.01 * 0.03
     assert cell_volumes(mesh).sum() == pytest.approx(section * 0.06 + 0.01 * 0.03 * 0.02, rel=1e-12)
-    around, (a, b, c) = 2 * (0.03 + 0.05), np.moveaxis(mesh.vertices[boundary_triangles(mesh)], 1, 0)
+    around, (a, b, c) = (
+        2 * (0.03 + 0.05),
+        np.moveaxis(mesh.vertices[boundary_triangles(mesh)], 1, 0),
+    )
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
     assert area == pytest.approx(2 * section + around * 0.06 + 2 * (0.01 + 0.03) * 0.02, rel=1e-9)
     corners = mesh.vertices[mesh.cells[:, :8]]
@@ -123,7 +137,11 @@ def test_a_cross_with_a_fin_is_filled_without_cracks(size, nodes):
     [
         ([], 0.01, "a body of boxes needs one box or more"),
         ([PLATE, (PLATE[1], PLATE[0])], 0.01, "box 2 reaches from [0.005, 0.025, 0.06] to [-0.005"),
-        ([((0, 0, 0), (0.1, 0.0, 0.1))], 0.01, "box 1 reaches from [0.0, 0.0, 0.0] to [0.1, 0.0, 0.1] m: it has no"),
+        (
+            [((0, 0, 0), (0.1, 0.0, 0.1))],
+            0.01,
+            "box 1 reaches from [0.0, 0.0, 0.0] to [0.1, 0.0, 0.1] m: it has no",
+        ),
         ([PLATE], 0.0, "the size of cells must be a positive length in metres, not 0.0"),
         ([PLATE, ((0.1, 0, 0), (0.2, 0.1, 0.1))], 0.01, "the boxes do not form one body"),
     ],
@@ -153,23 +171,36 @@ def test_selection_of_a_plane_and_of_an_edge():
     assert select_vertices(mesh, x=[0.1, 0.2], y=(-1.0, 0.0)).tolist() == [160, 161, 162, 163]
 
 
-SIZE, DIVISIONS = "size of a box must be three positive lengths", "divisions of a box must be three positive integers"
+SIZE = "size of a box must be three positive lengths"
+DIVISIONS = "divisions of a box must be three positive integers"
 BEAM = box_hexahedra()
 REFUSED = [
-    *((lambda size=size: box_hexahedra(size), SIZE) for size in ((0.1, 0, 1), (1, np.nan, 1), (1, 1), 0.1)),
+    *(
+        (lambda size=size: box_hexahedra(size), SIZE)
+        for size in ((0.1, 0, 1), (1, np.nan, 1), (1, 1), 0.1)
+    ),
     *(
         (lambda counts=counts: box_tetrahedra(divisions=counts), DIVISIONS)
         for counts in ((1, 0, 1), (1, 2.0, 1), (1, 1), (True, True, True))
     ),
     (lambda: box_tetrahedra(order=3), "order of tetrahedra must be 1 or 2, not 3"),
     (lambda: box_hexahedra(nodes=26), "hexahedra have 8, 20 or 27 nodes, not 26"),
-    (lambda: quadratic(BEAM, "tetrahedron10"), "nodes of tetrahedron10 cannot be added to hexahedron cells"),
-    (lambda: quadratic(box_tetrahedra(order=2)), "of a quadratic element cannot be added to tetrahedron10 cells"),
+    (
+        lambda: quadratic(BEAM, "tetrahedron10"),
+        "nodes of tetrahedron10 cannot be added to hexahedron cells",
+    ),
+    (
+        lambda: quadratic(box_tetrahedra(order=2)),
+        "of a quadratic element cannot be added to tetrahedron10 cells",
+    ),
     (lambda: Mesh(np.zeros((4, 2)), np.zeros((1, 4), int)), "^vertices must be"),
     (lambda: Mesh(np.zeros((4, 3), complex), np.zeros((1, 4), int)), "^vertices must be"),
     (lambda: Mesh(np.zeros((4, 3)), np.zeros((1, 5), int)), "^cells must be"),
     (lambda: Mesh(np.zeros((4, 3)), np.zeros((1, 4))), "^cells must be"),
-    (lambda: select_vertices(BEAM, x=0.2), r"x = 0\.2 m: .* a range for a face that is not flat, as in x=\[0, 0\.01\]"),
+    (
+        lambda: select_vertices(BEAM, x=0.2),
+        r"x = 0\.2 m: .* a range for a face that is not flat, as in x=\[0, 0\.01\]",
+    ),
     (lambda: select_vertices(BEAM, x=[0.011, 0.019]), r"x = 0\.011 to 0\.019 m"),
     (lambda: select_vertices(BEAM), "at least one of the coordinates"),
     *(
@@ -197,12 +228,21 @@ TURNED = [4, 5, 6, 7, 0, 1, 2, 3]
     ("broken", "match"),
     [
         (lambda m: Mesh(m.vertices, m.cells[:0]), "empty"),
-        (lambda m: with_vertex(m, 5, [0, np.nan, 0]), r"^1 of 176 vertices \(5; .* NaN or infinite"),
+        (
+            lambda m: with_vertex(m, 5, [0, np.nan, 0]),
+            r"^1 of 176 vertices \(5; .* NaN or infinite",
+        ),
         (lambda m: with_vertex(m, 7, [0, 0, 1e300]), r"^1 of 176 vertices \(7; .* NaN or infinite"),
         (lambda m: with_cell(m, 3, 1, 176), r"^1 of 90 cells \(3; .* outside 0 to 175"),
-        (lambda m: Mesh(np.vstack([m.vertices, [[1, 1, 1]]]), m.cells), r"^1 of 177 .* \(176; .* no cell"),
+        (
+            lambda m: Mesh(np.vstack([m.vertices, [[1, 1, 1]]]), m.cells),
+            r"^1 of 177 .* \(176; .* no cell",
+        ),
         (lambda m: with_cell(m, 8, TURNED, m.cells[8]), r"^1 of 90 cells \(8; .* inverted"),
-        (lambda m: Mesh(m.vertices, m.cells[:, TURNED]), r"^90 .* \(0, 1, 2, 3, 4, \.\.\.; .* inverted"),
+        (
+            lambda m: Mesh(m.vertices, m.cells[:, TURNED]),
+            r"^90 .* \(0, 1, 2, 3, 4, \.\.\.; .* inverted",
+        ),
     ],
 )
 def test_broken_meshes_are_refused_by_name(broken, match):
@@ -220,11 +260,15 @@ def test_flatness_is_relative_to_the_longest_edge(scale):
 
 
 def test_hexahedra_are_checked_at_their_corners_and_quadratic_tetrahedra_at_their_nodes():
-    """With corner 6 of the unit cube at (s, s, s) the determinant there is 3 s - 2; inside it is positive."""
+    """With corner 6 of the unit cube at (s, s, s) the determinant there is 3 s - 2.
+
+    Inside it is positive.
+    """
     cube = box_hexahedra((1, 1, 1), (1, 1, 1))
     check_mesh(with_vertex(cube, 7, 0.67))
     refuses(MeshError, "folded", check_mesh, with_vertex(cube, 7, 0.66))
-    # A midpoint at a quarter of its edge makes the map singular at the corner (quarter-point element).
+    # A midpoint at a quarter of its edge makes the map singular at the corner (quarter-point
+    # element).
     mesh = quadratic(Mesh(np.eye(4)[:, 1:], np.array([[0, 1, 2, 3]])))
     node = mesh.cells[0, 4]
     check_mesh(with_vertex(mesh, node, [0.26, 0, 0]))
@@ -236,7 +280,11 @@ def test_crack_between_coincident_vertices_is_refused(gap, cracked):
     left = box_hexahedra((0.1, 0.1, 0.1), (4, 4, 4))
     right = left.vertices + np.array([0.1 + gap, 0, 0])
     mesh = Mesh(np.vstack([left.vertices, right]), np.vstack([left.cells, left.cells + len(right)]))
-    with pytest.raises(MeshError, match=r"^25 of 250 .* on another one") if cracked else nullcontext():
+    with (
+        pytest.raises(MeshError, match=r"^25 of 250 .* on another one")
+        if cracked
+        else nullcontext()
+    ):
         check_mesh(mesh)
 
 
@@ -262,11 +310,19 @@ def test_unreferenced_vertices_are_dropped_only_on_request(tmp_path):
     assert np.array_equal(read.cells, mesh.cells)
 
 
-@pytest.mark.parametrize(("size", "written_in", "units"), [(0.1, "mm", "m"), (0.1, "m", "mm"), (6.0, "m", "m")])
+@pytest.mark.parametrize(
+    ("size", "written_in", "units"), [(0.1, "mm", "m"), (0.1, "m", "mm"), (6.0, "m", "m")]
+)
 def test_implausible_size_is_refused(tmp_path, size, written_in, units):
     path = write(tmp_path / "box.vtk", box_hexahedra([size] * 3, (1, 1, 1)), units=written_in)
     diagonal = f"{np.sqrt(3) * size * PER_METRE[written_in] / PER_METRE[units]:g} m"
-    refuses(MeshError, f"units={units}, .* is {diagonal}, .* did you mean units=", read_mesh, path, units=units)
+    refuses(
+        MeshError,
+        f"units={units}, .* is {diagonal}, .* did you mean units=",
+        read_mesh,
+        path,
+        units=units,
+    )
 
 
 def test_files_without_usable_cells_are_refused(tmp_path):
@@ -274,11 +330,15 @@ def test_files_without_usable_cells_are_refused(tmp_path):
     mixed = write(tmp_path / "mixed.vtk", hexahedra, ("tetra", tetrahedra.cells))
     refuses(MeshError, r"mixed.vtk: the file has hexahedron and tetra cells", read_mesh, mixed)
     surface = tmp_path / "surface.stl"
-    meshio.write(surface, meshio.Mesh(tetrahedra.vertices, [("triangle", boundary_triangles(tetrahedra))]))
+    meshio.write(
+        surface, meshio.Mesh(tetrahedra.vertices, [("triangle", boundary_triangles(tetrahedra))])
+    )
     refuses(MeshError, r"no tetrahedra or hexahedra \(only: triangle\)", read_mesh, surface)
 
 
-@pytest.mark.parametrize("name", ["missing.vtk", "folder.vtk", "mesh.xyz", "foreign.vtk", "cut.msh"])
+@pytest.mark.parametrize(
+    "name", ["missing.vtk", "folder.vtk", "mesh.xyz", "foreign.vtk", "cut.msh"]
+)
 def test_unreadable_file_gives_one_sentence_and_no_output(tmp_path, name, capfd):
     (tmp_path / "folder.vtk").mkdir()
     (tmp_path / "mesh.xyz").write_text("0 0 0\n")
@@ -298,20 +358,34 @@ def test_unreadable_file_gives_one_sentence_and_no_output(tmp_path, name, capfd)
 def test_format_that_needs_another_package_names_it(tmp_path, monkeypatch):
     path = write(tmp_path / "box.med", box_tetrahedra())
     (tmp_path / "without" / "h5py.py").parent.mkdir()
-    (tmp_path / "without" / "h5py.py").write_text("raise ModuleNotFoundError('no h5py', name='h5py')")
+    (tmp_path / "without" / "h5py.py").write_text(
+        "raise ModuleNotFoundError('no h5py', name='h5py')"
+    )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "without"))
     refuses(MeshError, "install the Python package h5py", read_mesh, path)
 
 
 @pytest.mark.slow
-def test_files_that_are_read_for_ever_or_claim_too_much_memory_end_with_one_sentence(tmp_path, monkeypatch):
+def test_files_that_are_read_for_ever_or_claim_too_much_memory_end_with_one_sentence(
+    tmp_path, monkeypatch
+):
     path = write(tmp_path / "cut.tec", box_tetrahedra())
     path.write_text(path.read_text()[:2000])
     monkeypatch.setattr(decoding, "SECONDS", (1.0, 0.0))
-    refuses(MeshError, r"cut\.tec: meshio cannot read .* \(decoding takes more than 1 s\)", read_mesh, path)
+    refuses(
+        MeshError,
+        r"cut\.tec: meshio cannot read .* \(decoding takes more than 1 s\)",
+        read_mesh,
+        path,
+    )
     path = write(tmp_path / "big.vtk", box_tetrahedra())
     path.write_bytes(path.read_bytes().replace(b"POINTS 176", b"POINTS 17600000000"))
-    refuses(MeshError, r"big\.vtk: VTK cannot read the file \(Unable to allocate 52800000003", read_mesh, path)
+    refuses(
+        MeshError,
+        r"big\.vtk: VTK cannot read the file \(Unable to allocate 52800000003",
+        read_mesh,
+        path,
+    )
     path = tmp_path / "big.inp"
     path.write_text("*ELSET, ELSET=all, GENERATE\n1, 10000000000\n")
     refuses(MeshError, r"big\.inp: it takes more than 20\d\d MiB of memory", read_mesh, path)
@@ -319,5 +393,8 @@ def test_files_that_are_read_for_ever_or_claim_too_much_memory_end_with_one_sent
 
 @pytest.mark.slow
 def test_importing_the_mesh_modules_leaves_meshio_alone():
-    code = "import sys, warp_resphys.mesh, warp_resphys.mesh.readers; sys.exit('meshio' in sys.modules)"
+    code = (
+        "import sys, warp_resphys.mesh, warp_resphys.mesh.readers; "
+        "sys.exit('meshio' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -7,7 +7,16 @@ import pytest
 from matplotlib.image import imread
 
 from support.refusals import refuses
-from warp_resphys import Body, InputError, MeshError, Scene, Simulator, box_hexahedra, quadratic, select_vertices
+from warp_resphys import (
+    Body,
+    InputError,
+    MeshError,
+    Scene,
+    Simulator,
+    box_hexahedra,
+    quadratic,
+    select_vertices,
+)
 from warp_resphys.mesh.plotting import BODY, REGIONS
 
 BOX = box_hexahedra((0.1, 0.02, 0.02), (5, 1, 1))
@@ -23,12 +32,18 @@ def colours(path):
 
 def actors(plotter):
     """Bounds and colours of the meshes."""
-    return {actor.prop.color.hex_rgb: actor.bounds for actor in plotter.actors.values() if hasattr(actor, "prop")}
+    return {
+        actor.prop.color.hex_rgb: actor.bounds
+        for actor in plotter.actors.values()
+        if hasattr(actor, "prop")
+    }
 
 
 @pytest.mark.parametrize("mesh", [BOX, quadratic(BOX)])
 def test_a_mesh_with_its_regions(tmp_path, mesh):
-    plotter = replace(mesh, regions={"tip": np.array([3, 4])}).plot(screenshot=tmp_path / "mesh.png")
+    plotter = replace(mesh, regions={"tip": np.array([3, 4])}).plot(
+        screenshot=tmp_path / "mesh.png"
+    )
     share, mean = colours(tmp_path / "mesh.png")
     assert 0.05 < share < 0.9
     assert mean.max() - mean.min() > 0.05  # The tip is blue.
@@ -48,5 +63,16 @@ def test_a_body_in_a_state_and_a_scene_and_what_cannot_be_drawn(tmp_path):
     plotter = Scene({"one": body, "two": beside}).plot(screenshot=tmp_path / "scene.png")
     assert BOX.plot(plotter=plotter) is plotter
     assert len([actor for actor in plotter.actors.values() if hasattr(actor, "prop")]) == 4
-    refuses(MeshError, r"positions to draw have shape \(2, 3\): give \(24, 3\)", BOX.plot, np.zeros((2, 3)))
-    refuses(InputError, r"shape \(2, 24, 3\), and environment is 2", Body(BOX).plot, np.zeros((2, 24, 3)), 2)
+    refuses(
+        MeshError,
+        r"positions to draw have shape \(2, 3\): give \(24, 3\)",
+        BOX.plot,
+        np.zeros((2, 3)),
+    )
+    refuses(
+        InputError,
+        r"shape \(2, 24, 3\), and environment is 2",
+        Body(BOX).plot,
+        np.zeros((2, 24, 3)),
+        2,
+    )

@@ -31,25 +31,37 @@ def test_along_a_curve_it_keeps_its_radius_and_does_not_twist_and_may_be_an_elli
     angle = np.linspace(0.0, np.pi / 2, 200)
     quarter = np.column_stack([0.2 * np.sin(angle), 0.0 * angle, 0.2 * np.cos(angle)])
     mesh = rod(quarter, 0.01, 20)
-    distance = np.hypot(np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 2]) - 0.2, mesh.vertices[:, 1])
+    distance = np.hypot(
+        np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 2]) - 0.2, mesh.vertices[:, 1]
+    )
     assert distance.max() == pytest.approx(0.01, rel=0.01)
     assert cell_volumes(mesh).sum() == pytest.approx(np.pi * 0.01**2 * 0.2 * np.pi / 2, rel=0.002)
     x, y, z = mesh.vertices.T
     first, last = np.sort(y[np.abs(x) < 1e-9]), np.sort(y[np.abs(z) < 1e-9])
-    np.testing.assert_allclose(first, last, atol=1e-4)  # a section that does not turn about the axis
-    # Of which the first semi-axis is along the coordinate axis that the rod crosses most squarely, y here.
+    # a section that does not turn about the axis
+    np.testing.assert_allclose(first, last, atol=1e-4)
+    # Of which the first semi-axis is along the coordinate axis that the rod crosses most squarely,
+    # y here.
     profile = np.array([[0.0, 0.02, 0.005], [0.201, 0.01, 0.005]])
     mesh = rod([[0.0, 0.0, 0.0], [0.02, 0.0, -0.2]], profile, 8, nodes=27)
     assert cell_volumes(mesh).sum() == pytest.approx(np.pi * 0.015 * 0.005 * 0.201, rel=3e-3)
-    first, last = mesh.vertices[mesh.vertices[:, 2] > -1e-3], mesh.vertices[mesh.vertices[:, 2] < -0.199]
-    assert (np.ptp(first[:, 1]), np.ptp(last[:, 1])) == (pytest.approx(0.04, rel=0.01), pytest.approx(0.02, rel=0.01))
-    assert (np.ptp(first[:, 0]), np.ptp(last[:, 0])) == (pytest.approx(0.01, rel=0.02), pytest.approx(0.01, rel=0.02))
+    first = mesh.vertices[mesh.vertices[:, 2] > -1e-3]
+    last = mesh.vertices[mesh.vertices[:, 2] < -0.199]
+    assert (np.ptp(first[:, 1]), np.ptp(last[:, 1])) == (
+        pytest.approx(0.04, rel=0.01),
+        pytest.approx(0.02, rel=0.01),
+    )
+    assert (np.ptp(first[:, 0]), np.ptp(last[:, 0])) == (
+        pytest.approx(0.01, rel=0.02),
+        pytest.approx(0.01, rel=0.02),
+    )
 
 
 @pytest.mark.parametrize("noise", [0.0, 6e-17, -6e-17])
 def test_an_ellipse_does_not_turn_on_a_rounding_error(noise):
     mesh = rod([[0.0, 0.0, 0.0], [noise, 2.0 * noise, -0.2]], [[0.0, 0.02, 0.005]], 4)
-    assert np.ptp(mesh.vertices[:, 0]) == pytest.approx(0.04, rel=0.01)  # x comes first where x and y are alike
+    # x comes first where x and y are alike
+    assert np.ptp(mesh.vertices[:, 0]) == pytest.approx(0.04, rel=0.01)
     assert np.ptp(mesh.vertices[:, 1]) == pytest.approx(0.01, rel=0.02)
 
 
@@ -84,7 +96,9 @@ def test_points_are_found_in_their_cells(mesh):
     inside = random.uniform([0.0, 0.01, 0.005], [0.1, 0.02, 0.015], (30, 3))
     places = locate(mesh, inside)
     np.testing.assert_allclose(
-        np.einsum("pk,pki->pi", places.weights, mesh.vertices[mesh.cells[places.cells]]), inside, atol=1e-12
+        np.einsum("pk,pki->pi", places.weights, mesh.vertices[mesh.cells[places.cells]]),
+        inside,
+        atol=1e-12,
     )
     np.testing.assert_allclose(places.weights.sum(1), 1.0, atol=1e-12)
     assert places.outside.max() == 0.0

@@ -51,10 +51,14 @@ def test_surfaces_within_are_chambers(tmp_path):
             if turned:
                 hole.invert()
         mesh = fill_surface(written(tmp_path, outer, *holes), 0.008, "mm", order=1)
-        assert cell_volumes(mesh).sum() == pytest.approx(1e-9 * (outer.volume - 2 * 8400.0), rel=0.02)
+        assert cell_volumes(mesh).sum() == pytest.approx(
+            1e-9 * (outer.volume - 2 * 8400.0), rel=0.02
+        )
         chambers = find_chambers(mesh)
         assert len(chambers) == 2
-        centres = sorted(mesh.vertices[np.unique(chamber.faces)].mean(axis=0)[0] for chamber in chambers)
+        centres = sorted(
+            mesh.vertices[np.unique(chamber.faces)].mean(axis=0)[0] for chamber in chambers
+        )
         np.testing.assert_allclose(centres, [-0.009, 0.009], atol=5e-4)
 
 
@@ -76,11 +80,16 @@ def test_files_that_are_no_closed_surface(tmp_path):
     box = trimesh.creation.box((100.0, 30.0, 20.0))
     box.update_faces(np.arange(12) != 5)
     with pytest.raises(
-        MeshError, match=r"3 edges of its triangles do not have two of them, the first at \(.*\): close"
+        MeshError,
+        match=r"3 edges of its triangles do not have two of them, the first at \(.*\): close",
     ):
         fill_surface(written(tmp_path, box), 0.01, "mm")
     refuses(MeshError, "there is no such file", fill_surface, tmp_path / "other.stl", 0.01)
-    broken = {"torn.stl": b"solid robot\nfacet nor", "robot.obj": b"\x00\x01", "robot.xyz": b"1 2 3\n"}
+    broken = {
+        "torn.stl": b"solid robot\nfacet nor",
+        "robot.obj": b"\x00\x01",
+        "robot.xyz": b"1 2 3\n",
+    }
     for name, content in broken.items():
         (tmp_path / name).write_bytes(content)
         refuses(MeshError, "export", fill_surface, tmp_path / name, 0.01)
@@ -88,7 +97,9 @@ def test_files_that_are_no_closed_surface(tmp_path):
 
 @pytest.mark.usefixtures("_gmsh")
 def test_files_as_other_programs_write_them(tmp_path):
-    """With texture coordinates of its own at each corner, and with triangles that turn either way."""
+    """With texture coordinates of its own at each corner,
+    and with triangles that turn either way.
+    """
     box = trimesh.creation.box((100.0, 30.0, 20.0))
     path, corners = tmp_path / "robot.obj", "".join(f"v {x} {y} {z}\n" for x, y, z in box.vertices)
     textures = "".join(f"vt {u:.4f} {1.0 - u:.4f}\n" for u in np.linspace(0.0, 1.0, 36))
@@ -101,11 +112,20 @@ def test_files_as_other_programs_write_them(tmp_path):
     turned = box.copy()
     turned.faces[:5] = turned.faces[:5, ::-1]
     turned.export(tmp_path / "turned.ply")
-    assert cell_volumes(fill_surface(tmp_path / "turned.ply", 0.01, "mm", 1)).sum() == pytest.approx(6e-5, rel=1e-6)
+    assert cell_volumes(
+        fill_surface(tmp_path / "turned.ply", 0.01, "mm", 1)
+    ).sum() == pytest.approx(6e-5, rel=1e-6)
 
 
 def test_bodies_beside_one_another(tmp_path):
     other = trimesh.creation.box((10.0, 10.0, 10.0))
     other.apply_translation([80.0, 0.0, 0.0])
     path = written(tmp_path, trimesh.creation.box((100.0, 30.0, 20.0)), other)
-    refuses(MeshError, r"closed surfaces beside one another \(2 in all\)", fill_surface, path, 0.01, "mm")
+    refuses(
+        MeshError,
+        r"closed surfaces beside one another \(2 in all\)",
+        fill_surface,
+        path,
+        0.01,
+        "mm",
+    )

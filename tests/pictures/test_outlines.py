@@ -68,7 +68,9 @@ def test_silhouette_of_a_sphere():
 
 
 def test_what_the_body_covers_is_no_outline_and_what_a_clamp_hides_does_not_count():
-    """A small box before a large one: its own edges are inside, and the outline is that of the large one."""
+    """A small box before a large one: its own edges are inside,
+    and the outline is that of the large one.
+    """
     large, small = (trimesh.creation.box((size, size, 0.2)) for size in (2.0, 0.5))
     small.apply_translation((0.1, 0.0, -1.0))
     both = trimesh.util.concatenate([large, small])
@@ -86,7 +88,9 @@ def test_closest_points_of_a_silhouette():
     box = trimesh.creation.box((2.0, 2.0, 0.2))
     half = 800.0 / 4.9
     rim = ClosedSurface.of(np.asarray(box.faces)).silhouette(seen(box))
-    points = np.array([[half + 7.0, 10.0], [half - 5.0, 10.0], [0.0, -half - 0.3], [half + 3.0, half + 4.0]])
+    points = np.array(
+        [[half + 7.0, 10.0], [half - 5.0, 10.0], [0.0, -half - 0.3], [half + 3.0, half + 4.0]]
+    )
     index, distance, gradient = rim.closest(points)
     assert distance == pytest.approx([7.0, -5.0, 0.3, 5.0], abs=0.3)
     assert gradient[:3] == pytest.approx(np.array([[1.0, 0.0], [1.0, 0.0], [0.0, -1.0]]), abs=0.06)
@@ -99,4 +103,6 @@ def test_a_surface_is_closed_and_before_the_camera():
     refuses(InputError, "not closed", ClosedSurface.of, np.asarray(box.faces)[1:])
     pixels = seen(box)
     pixels[3] = np.nan
-    refuses(InputError, "behind the camera", ClosedSurface.of(np.asarray(box.faces)).silhouette, pixels)
+    refuses(
+        InputError, "behind the camera", ClosedSurface.of(np.asarray(box.faces)).silhouette, pixels
+    )

@@ -9,7 +9,14 @@ from PIL import Image
 
 from support.refusals import refuses
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.pictures.scene_files import read_depth, read_mask, read_picture, read_scan, read_scene, read_tracked
+from warp_resphys.pictures.scene_files import (
+    read_depth,
+    read_mask,
+    read_picture,
+    read_scan,
+    read_scene,
+    read_tracked,
+)
 from warp_resphys.settings.pictures import ColourSettings
 
 FRAME = {"image": "00.png", "time": 0.5, "world_to_camera": np.eye(4).tolist()}
@@ -33,7 +40,10 @@ def picture(path):
 
 def test_cameras_and_masks_of_a_scene(tmp_path):
     picture(tmp_path / "00.png")
-    content = {"frames": [FRAME, {**FRAME, "mask": "mask.png"}], "fixed": [{"vertices": [3, 1]}, {"vertices": [7]}]}
+    content = {
+        "frames": [FRAME, {**FRAME, "mask": "mask.png"}],
+        "fixed": [{"vertices": [3, 1]}, {"vertices": [7]}],
+    }
     scene = read_scene(write(tmp_path / "camera.json", content))
     assert [clamp.tolist() for clamp in scene.clamps] == [[3, 1], [7]]
     assert [frame.number for frame in scene.frames] == [0, 1]
@@ -50,7 +60,9 @@ def test_cameras_and_masks_of_a_scene(tmp_path):
     assert read_mask(scene.frames[1], None).sum() == 16
     with pytest.raises(InputError, match=r"00.png: no part has a hue from 100 to 140 degrees"):
         read_mask(scene.frames[0], ColourSettings(hue=(100.0, 140.0)))
-    refuses(DataFileError, r"has no mask: name one in camera.json", read_mask, scene.frames[0], None)
+    refuses(
+        DataFileError, r"has no mask: name one in camera.json", read_mask, scene.frames[0], None
+    )
 
 
 def test_depth_images(tmp_path):
@@ -72,8 +84,13 @@ def test_depth_images(tmp_path):
 def test_scenes_with_depths_lenses_and_a_scan(tmp_path):
     moved = np.eye(4)
     moved[:3, 3] = (0.1, 0.0, 0.0)
-    frames = [{**FRAME, "depth": "00_depth.png", "lens": "left"}, {"depth": "01.npy", "lens": "right"}]
-    scene = read_scene(write(tmp_path / "camera.json", {"frames": frames, "world_to_cloud": moved.tolist()}))
+    frames = [
+        {**FRAME, "depth": "00_depth.png", "lens": "left"},
+        {"depth": "01.npy", "lens": "right"},
+    ]
+    scene = read_scene(
+        write(tmp_path / "camera.json", {"frames": frames, "world_to_cloud": moved.tolist()})
+    )
     assert [frame.lens for frame in scene.frames] == ["left", "right"]
     assert scene.frames[0].depth == tmp_path / "00_depth.png"
     assert scene.frames[1].image == scene.frames[1].depth == tmp_path / "01.npy"
@@ -87,13 +104,21 @@ def test_scenes_with_depths_lenses_and_a_scan(tmp_path):
 def points_of(path):
     """Points of a tetrahedron with a colour, in a format for each extension."""
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    header = "# .PCD\nFIELDS rgb x y z\nSIZE 4 4 4 4\nTYPE U F F F\nCOUNT 1 1 1 1\nWIDTH 4\nHEIGHT 1\nPOINTS 4\n"
+    header = (
+        "# .PCD\nFIELDS rgb x y z\nSIZE 4 4 4 4\nTYPE U F F F\nCOUNT 1 1 1 1\nWIDTH 4\nHEIGHT "
+        "1\nPOINTS 4\n"
+    )
     rows = np.column_stack([np.full(4, 7.0), points])
     if path.name == "ascii.pcd":
-        path.write_text(header + "DATA ascii\n" + "\n".join(" ".join(f"{x:g}" for x in row) for row in rows))
+        path.write_text(
+            header + "DATA ascii\n" + "\n".join(" ".join(f"{x:g}" for x in row) for row in rows)
+        )
     elif path.name == "binary.pcd":
         kinds = [("rgb", "<u4"), ("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
-        path.write_bytes((header + "DATA binary\n").encode() + np.array([*map(tuple, rows)], dtype=kinds).tobytes())
+        path.write_bytes(
+            (header + "DATA binary\n").encode()
+            + np.array([*map(tuple, rows)], dtype=kinds).tobytes()
+        )
     elif path.suffix == ".npy":
         np.save(path, points)
     else:
@@ -120,7 +145,9 @@ def test_a_scanned_surface_has_points_on_its_triangles_and_outer_normals(tmp_pat
 def test_files_that_are_no_scans_are_said(tmp_path):
     (tmp_path / "scan.txt").write_text("0 0 0")
     (tmp_path / "scan.ply").write_text("nothing")
-    (tmp_path / "packed.pcd").write_text("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA binary_compressed\n")
+    (tmp_path / "packed.pcd").write_text(
+        "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA binary_compressed\n"
+    )
     np.save(tmp_path / "flat.npy", np.zeros((4, 2)))
     np.save(tmp_path / "empty.npy", np.full((4, 3), np.nan))
     for name, words in {
@@ -153,7 +180,10 @@ def test_a_turned_picture_is_read_as_it_is_seen(tmp_path):
         ({"frames": [{**FRAME, "world_to_camera": [1, 2]}]}, r"frames\[0\].world_to_camera"),
         ({"frames": [FRAME], "fixed": [{"vertex": 1}]}, r"fixed\[0\].vertices is missing"),
         ({"frames": [FRAME], "fixed": [{"vertices": []}]}, r"fixed\[0\].vertices is \[\]"),
-        ({"frames": [{**FRAME, "world_to_camera": np.diag([2, 2, 2, 1]).tolist()}]}, "is no rotation with a shift"),
+        (
+            {"frames": [{**FRAME, "world_to_camera": np.diag([2, 2, 2, 1]).tolist()}]},
+            "is no rotation with a shift",
+        ),
     ],
 )
 def test_a_damaged_scene_is_named(tmp_path, content, sentence):
@@ -174,7 +204,9 @@ def test_tracked_points_of_known_programs(tmp_path):
     assert read_tracked(plain, ["base", "tip"], 0.6, [0, 7]) == pytest.approx(wanted, nan_ok=True)
     tracks = np.nan_to_num(wanted)
     np.savez(tmp_path / "cotracker.npz", tracks=tracks, visibility=np.array([[1, 1], [1, 0]]))
-    assert read_tracked(tmp_path / "cotracker.npz", ["base", "tip"], 0.6, [0, 1]) == pytest.approx(wanted, nan_ok=True)
+    assert read_tracked(tmp_path / "cotracker.npz", ["base", "tip"], 0.6, [0, 1]) == pytest.approx(
+        wanted, nan_ok=True
+    )
 
 
 @pytest.mark.parametrize(
@@ -187,12 +219,25 @@ def test_tracked_points_of_known_programs(tmp_path):
     ],
 )
 def test_a_damaged_table_is_named(tmp_path, text, sentence):
-    refuses(DataFileError, sentence, read_tracked, write(tmp_path / "a.csv", text), ["base", "tip"], 0.6, [0, 1])
+    refuses(
+        DataFileError,
+        sentence,
+        read_tracked,
+        write(tmp_path / "a.csv", text),
+        ["base", "tip"],
+        0.6,
+        [0, 1],
+    )
 
 
 def test_tracks_of_another_shape_are_refused(tmp_path):
-    refuses(DataFileError, "Cannot read", read_tracked, tmp_path / "missing.csv", ["base"], 0.6, [0])
-    for arrays in ({"tracks": np.zeros((4, 3, 2))}, {"tracks": np.zeros((4, 2, 2)), "visibility": np.ones(4)}):
+    refuses(
+        DataFileError, "Cannot read", read_tracked, tmp_path / "missing.csv", ["base"], 0.6, [0]
+    )
+    for arrays in (
+        {"tracks": np.zeros((4, 3, 2))},
+        {"tracks": np.zeros((4, 2, 2)), "visibility": np.ones(4)},
+    ):
         np.savez(tmp_path / "b.npz", **arrays)
         with pytest.raises(DataFileError, match="cannot read tracked points"):
             read_tracked(tmp_path / "b.npz", ["base", "tip"], 0.6, [0])

@@ -1,4 +1,6 @@
-"""Pictures of a body that is released: rows at their own times, derivatives, and the parameters that come back."""
+"""Pictures of a body that is released: rows at their own times,
+derivatives, and the parameters that come back.
+"""
 
 import math
 from dataclasses import replace
@@ -11,18 +13,32 @@ import warp_resphys as wr
 from support.refusals import refuses
 from support.slopes import differences
 from warp_resphys.experiment.pictures.camera_laboratory import noisy_mask
-from warp_resphys.pictures import ClosedSurface, Cloud, Lens, Outline, Photo, PictureMisfit, PlacedCamera, SeenPose
+from warp_resphys.pictures import (
+    ClosedSurface,
+    Cloud,
+    Lens,
+    Outline,
+    Photo,
+    PictureMisfit,
+    PlacedCamera,
+    SeenPose,
+)
 from warp_resphys.pictures.released_force import ReleasedForce, at_row_times
 from warp_resphys.settings.learning import Bounds, Prior
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(4, 1, 1), nodes=20)
-LENS = Lens(torch.tensor([[700.0, 0.0, 160.0], [0.0, 700.0, 120.0], [0.0, 0.0, 1.0]], dtype=torch.float64))
+LENS = Lens(
+    torch.tensor([[700.0, 0.0, 160.0], [0.0, 700.0, 120.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+)
 LOOKS = torch.tensor(  # from the side: x right, z up
-    [[1.0, 0.0, 0.0, -0.05], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.3], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64
+    [[1.0, 0.0, 0.0, -0.05], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.3], [0.0, 0.0, 0.0, 1.0]],
+    dtype=torch.float64,
 )
 CLAMP, TIP = (wr.select_vertices(MESH, x=x) for x in (0.0, 0.1))
 CAMERA = PlacedCamera(LENS, LOOKS, torch.tensor([0.0, 0.01, 0.01], dtype=torch.float64))
-POINTS = wr.bind_markers(MESH, [[0.1, 0.0, 0.01], [0.06, 0.0, 0.01], [0.08, 0.0, 0.02]], ["a", "b", "c"])
+POINTS = wr.bind_markers(
+    MESH, [[0.1, 0.0, 0.01], [0.06, 0.0, 0.01], [0.08, 0.0, 0.02]], ["a", "b", "c"]
+)
 SIZE = (240, 320)
 ROW_TIME, RATE = 6e-5, 60.0  # s, Hz: the rows take 14 ms
 RANGES = {
@@ -41,14 +57,26 @@ TRUTH = {
     "release_force_3": 0.01,
     "camera_shift_3": 0.003,
 }
-FIRST = {**TRUTH, "youngs_modulus": 1.5e5, "density": 1000.0, "stiffness_damping": 2e-3, "release_delay": 0.0}
+FIRST = {
+    **TRUTH,
+    "youngs_modulus": 1.5e5,
+    "density": 1000.0,
+    "stiffness_damping": 2e-3,
+    "release_delay": 0.0,
+}
 
 
 def released(frames=18, row_time=ROW_TIME, outlines=False):
-    """A beam that is released at 0.05 s, with tracked points and perhaps outlines in every picture."""
+    """A beam that is released at 0.05 s, with tracked points
+    and perhaps outlines in every picture.
+    """
     body = wr.Body(MESH, fixed=CLAMP)
     simulator = wr.Simulator(
-        body, wr.Corotated(2e5, 0.45), time_step=1.0 / 240.0, gravity=(0.0, 0.0, -9.81), integrator="bdf2"
+        body,
+        wr.Corotated(2e5, 0.45),
+        time_step=1.0 / 240.0,
+        gravity=(0.0, 0.0, -9.81),
+        integrator="bdf2",
     )
     surface = ClosedSurface.of(MESH)
     photos = tuple(Photo(f"{n}", CAMERA, time=n / RATE, row_time=row_time) for n in range(frames))
@@ -71,7 +99,9 @@ def seen():
 
 
 def test_rows_are_exposed_at_their_own_times():
-    """Points that fall, z = z0 + v t + a t^2 / 2, in closed form: a row is the root of a quadratic equation."""
+    """Points that fall, z = z0 + v t + a t^2 / 2, in closed form:
+    a row is the root of a quadratic equation.
+    """
     step, begin, scale = 0.01, 0.083, 700.0 / 0.3
     heights, speeds, fall = np.array([0.0, 0.02, -0.01]), np.array([0.3, -0.5, 0.1]), -9.81
     s = step * np.arange(30)[:, None]
@@ -87,7 +117,11 @@ def test_rows_are_exposed_at_their_own_times():
     r = ROW_TIME
     for row, velocity, z0, v in zip(rows, velocities.numpy(), heights, speeds, strict=True):
         at_begin = z0 + v * begin + 0.5 * fall * begin**2
-        equation = (-0.5 * scale * fall * r**2, -scale * (v + fall * begin) * r - 1.0, 120.0 - scale * at_begin)
+        equation = (
+            -0.5 * scale * fall * r**2,
+            -scale * (v + fall * begin) * r - 1.0,
+            120.0 - scale * at_begin,
+        )
         exact = min(np.roots(equation), key=lambda root: abs(root - row))
         assert row == pytest.approx(exact, abs=1e-4)
         assert velocity == pytest.approx([0.0, 0.0, v + fall * (begin + r * exact)], abs=1e-6)
@@ -106,11 +140,15 @@ def with_depths(pose):
         q = pose.vertices(photo, shape, TRUTH)[side]
         deep = CAMERA.seen_from(q, corrections)[:, 2:] - 0.002
         measured = torch.cat([CAMERA.pixels(q, corrections), deep], 1).numpy()
-        photos.append(replace(photo, tracked=None, cloud=Cloud(measured, measured * (1.0, 1.0, 0.0))))
+        photos.append(
+            replace(photo, tracked=None, cloud=Cloud(measured, measured * (1.0, 1.0, 0.0)))
+        )
     return replace(pose, photos=tuple(photos))
 
 
-@pytest.mark.parametrize(("kind", "tolerance"), [("points", 3e-3), ("outlines", 0.05), ("depths", 0.05)])
+@pytest.mark.parametrize(
+    ("kind", "tolerance"), [("points", 3e-3), ("outlines", 0.05), ("depths", 0.05)]
+)
 def test_derivatives_are_those_of_differences(kind, tolerance):
     """By physical parameters, release and camera, where rows have times of their own."""
     own = released(6, outlines=kind == "outlines")
@@ -120,13 +158,25 @@ def test_derivatives_are_those_of_differences(kind, tolerance):
         own = with_depths(own)
     misfit = PictureMisfit([own], RANGES)
     unit = misfit.to_unit({**FIRST, "camera_shift_3": 0.001})
-    gradient = np.array(differences(lambda x: misfit.linearise(x, derivatives=False).loss, unit, 1e-3))
-    assert misfit.linearise(unit).gradient == pytest.approx(gradient, rel=tolerance, abs=tolerance * gradient.max())
+    gradient = np.array(
+        differences(lambda x: misfit.linearise(x, derivatives=False).loss, unit, 1e-3)
+    )
+    assert misfit.linearise(unit).gradient == pytest.approx(
+        gradient, rel=tolerance, abs=tolerance * gradient.max()
+    )
 
 
 def test_what_cannot_be_released_is_named(seen):
-    refuses(wr.InputError, "no vertex carries the force", ReleasedForce, np.array([], dtype=int), (0.0, 0.0, 1.0))
-    refuses(wr.InputError, "give three numbers and a time", ReleasedForce, TIP, (0.0, 0.0, math.nan))
+    refuses(
+        wr.InputError,
+        "no vertex carries the force",
+        ReleasedForce,
+        np.array([], dtype=int),
+        (0.0, 0.0, 1.0),
+    )
+    refuses(
+        wr.InputError, "give three numbers and a time", ReleasedForce, TIP, (0.0, 0.0, math.nan)
+    )
     scan = Photo("scan", PlacedCamera(None, LOOKS, CAMERA.centre))
     refuses(wr.InputError, "beam moves, and a scan shows no time", replace, seen, photos=(scan,))
     with pytest.raises(wr.InputError, match="no parameter 'clamp_turn' to identify"):

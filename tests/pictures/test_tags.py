@@ -29,11 +29,15 @@ def pose(turn):
 
 def picture(camera):
     """The tag, seen by a camera."""
-    return draw_tag(np.full((500, 660, 3), 60, dtype=np.uint8), camera, MATRIX, PLACE, RIGHT, UP, SIZE, 7)
+    return draw_tag(
+        np.full((500, 660, 3), 60, dtype=np.uint8), camera, MATRIX, PLACE, RIGHT, UP, SIZE, 7
+    )
 
 
 def tag(number=7, dictionary="4x4_50", up=UP):
-    return TagSettings(dictionary=dictionary, number=number, size=SIZE, centre=[*PLACE], right=[*RIGHT], up=[*up])
+    return TagSettings(
+        dictionary=dictionary, number=number, size=SIZE, centre=[*PLACE], right=[*RIGHT], up=[*up]
+    )
 
 
 @pytest.mark.parametrize("turn", [(0.0, 0.6, 0.0), (0.5, -0.2, 0.1)])
@@ -51,5 +55,14 @@ def test_one_of_the_poses_of_a_tag_is_that_of_the_camera(turn):
 
 def test_a_tag_that_is_not_seen_has_no_pose_and_it_is_one_of_opencvs_with_two_edges():
     assert tag_poses(tag(3), picture(pose((0.0, 0.3, 0.0))), LENS) == []
-    refuses(InputError, "OpenCV has no tags '9x9_1'", tag_poses, tag(dictionary="9x9_1"), np.zeros((9, 9, 3)), LENS)
-    refuses(InputError, "must be perpendicular", tag_poses, tag(up=RIGHT), np.zeros((9, 9, 3)), LENS)
+    refuses(
+        InputError,
+        "OpenCV has no tags '9x9_1'",
+        tag_poses,
+        tag(dictionary="9x9_1"),
+        np.zeros((9, 9, 3)),
+        LENS,
+    )
+    refuses(
+        InputError, "must be perpendicular", tag_poses, tag(up=RIGHT), np.zeros((9, 9, 3)), LENS
+    )

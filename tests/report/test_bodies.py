@@ -1,4 +1,6 @@
-"""Pictures and films of motions: bodies, dots, rings and trails where they are, and films as long as the motion."""
+"""Pictures and films of motions: bodies, dots, rings and trails where they are,
+and films as long as the motion.
+"""
 
 from dataclasses import replace
 
@@ -14,7 +16,12 @@ from warp_resphys.experiment.build import shipped_arm
 from warp_resphys.mesh.chambers import find_chambers
 from warp_resphys.report import body_picture, render
 from warp_resphys.report.body_motions import ComparedMotion, DrivenBodies
-from warp_resphys.report.body_picture import NOMINAL, MeshSummary, mesh_picture, registration_picture
+from warp_resphys.report.body_picture import (
+    NOMINAL,
+    MeshSummary,
+    mesh_picture,
+    registration_picture,
+)
 from warp_resphys.report.data import Recordings
 from warp_resphys.report.layers import INK, MEASURED
 from warp_resphys.report.wording import TONES
@@ -58,7 +65,9 @@ def test_instants_show_bodies_dots_and_rings(renderer):
 def test_one_marker_alone_is_seen_from_a_distance_that_shows_its_body(renderer):
     several = motion(2)
     markers = {model: each[:, :1] for model, each in several.markers.items()}
-    alone = replace(several, measured=several.measured[:, :1], markers=markers, bound=several.bound[:1])
+    alone = replace(
+        several, measured=several.measured[:, :1], markers=markers, bound=several.bound[:1]
+    )
     _, near = alone.scene().views
     assert near.half_height >= 0.03 * 0.1
     assert (halves(alone.scene(), renderer)[0, 0, ..., 3] > 200).mean() > 0.3
@@ -66,10 +75,15 @@ def test_one_marker_alone_is_seen_from_a_distance_that_shows_its_body(renderer):
 
 def test_second_view_is_from_below():
     """Where the end of an arm is about round, and as small as it is."""
-    arm, bound = shipped_arm("arm_hexahedra_500"), np.array(list(arm_settings().markers.tracked.values()))
+    arm = shipped_arm("arm_hexahedra_500")
+    bound = np.array(list(arm_settings().markers.tracked.values()))
     body, markers = np.stack([arm.vertices] * 2), np.stack([bound] * 2)
     models = {"resphys": body}, {"resphys": markers}
-    side, below = ComparedMotion(arm, np.arange(2.0), markers, *models, bound, DOWN, from_below=True).scene().views
+    side, below = (
+        ComparedMotion(arm, np.arange(2.0), markers, *models, bound, DOWN, from_below=True)
+        .scene()
+        .views
+    )
     assert side.axes[1, 2] > 0.9
     np.testing.assert_allclose(below.axes[2], DOWN / 9.8, atol=1e-12)
     width = np.ptp((arm.vertices @ below.axes.T)[:, :2], axis=0)
@@ -81,20 +95,29 @@ def test_second_view_is_from_below():
 def test_picture_of_an_arm_has_markers_where_it_is_whole(tmp_path):
     arm = shipped_arm("arm_hexahedra_500")
     body = MeshSummary(arm, np.flatnonzero(arm.vertices[:, 2] == 0.0), find_chambers(arm))
-    near = [np.flatnonzero(np.abs(arm.vertices[:, 2] - z) < 0.01) for z in (-0.05, -0.1, -0.15, -0.2)]
+    near = [
+        np.flatnonzero(np.abs(arm.vertices[:, 2] - z) < 0.01) for z in (-0.05, -0.1, -0.15, -0.2)
+    ]
     nearest = [some[(arm.vertices[some] @ body_picture.TOWARDS_VIEWER).argmax()] for some in near]
     places = arm.vertices[nearest]
-    below = np.append(places, [[0.0, 0.0, arm.vertices[:, 2].min() - 0.05]], axis=0)  # on a stem below the tip
+    # On a stem below the tip.
+    below = np.append(places, [[0.0, 0.0, arm.vertices[:, 2].min() - 0.05]], axis=0)
     for name, markers in (("plain", None), ("dots", places), ("below", below)):
         picture = mesh_picture(body, markers)
         picture.save(tmp_path / f"{name}.png", picture.draw())
-    plain, dots, longer = (imread(tmp_path / f"{name}.png")[..., :3] for name in ("plain", "dots", "below"))
+    plain, dots, longer = (
+        imread(tmp_path / f"{name}.png")[..., :3] for name in ("plain", "dots", "below")
+    )
     changed = np.abs(plain - dots).max(axis=2) > 0.2
     left, middle, right = (part.sum() for part in np.array_split(changed, 3, axis=1))
     assert middle == 0
     assert min(left, right) > 500
-    inked = [int((picture[: int(0.9 * len(picture))].min(axis=2) < 0.95).sum()) for picture in (longer, plain)]
-    assert inked[0] < 0.9 * inked[1]  # the picture reaches as far, so that the body is smaller in it
+    inked = [
+        int((picture[: int(0.9 * len(picture))].min(axis=2) < 0.95).sum())
+        for picture in (longer, plain)
+    ]
+    # The picture reaches as far, so that the body is smaller in it.
+    assert inked[0] < 0.9 * inked[1]
 
 
 @pytest.mark.usefixtures("can_draw")
@@ -108,15 +131,33 @@ def test_film_moves_and_is_slower_than_the_motion(tmp_path, capsys, renderer):
     about = next(reader)
     width, height = about["size"]
     assert about["fps"] == pytest.approx(12.5)  # 50 Hz, four times slower.
-    frames = [np.frombuffer(frame, np.uint8).reshape(height, width, 3).astype(int) for frame in reader]
+    frames = [
+        np.frombuffer(frame, np.uint8).reshape(height, width, 3).astype(int) for frame in reader
+    ]
     assert len(frames) == 4
     assert np.abs(frames[1] - frames[0]).mean() > 1.0
     assert (tmp_path / "motion.mp4").stat().st_size < 200_000
 
 
 MESH = box_hexahedra(divisions=(3, 2, 2))
-NAMES = ["Tip - 1", "Tip - 2", "Tip - 3", "Base - 1", "Base - 2", "a marker with a rather long name"]
-POINTS = np.array([[0.1, 0.01, 0.04], [0.1, -0.01, 0.02], [0.1, 0.04, 0], [0, -0.01, 0], [0, 0.04, 0.03], [0, 0.04, 0]])
+NAMES = [
+    "Tip - 1",
+    "Tip - 2",
+    "Tip - 3",
+    "Base - 1",
+    "Base - 2",
+    "a marker with a rather long name",
+]
+POINTS = np.array(
+    [
+        [0.1, 0.01, 0.04],
+        [0.1, -0.01, 0.02],
+        [0.1, 0.04, 0],
+        [0, -0.01, 0],
+        [0, 0.04, 0.03],
+        [0, 0.04, 0],
+    ]
+)
 
 
 def drawn(measured, path, **options):
@@ -126,7 +167,9 @@ def drawn(measured, path, **options):
     fit = {key: dict(zip(registered.names, values, strict=True)) for key, values in fit.items()}
     fits = {"Beam": {**fit, "rms_mm": 0.0, "outliers": registered.outliers}}
     nominal = dict(zip(NAMES, POINTS, strict=True))
-    picture = registration_picture(Recordings({}, fits, nominal, (), MESH), select_vertices(MESH, x=0.0))
+    picture = registration_picture(
+        Recordings({}, fits, nominal, (), MESH), select_vertices(MESH, x=0.0)
+    )
     return imread(picture.save(path, picture.draw()))[..., :3]
 
 
@@ -168,7 +211,9 @@ def bodies(step, count):
     return DrivenBodies(times, triangles, positions, points, path, np.stack([X, Y]), -9.81 * Z)
 
 
-@pytest.mark.parametrize(("step", "slower", "frames", "fps"), [(0.01, 1.0, 26, 25.0), (0.01, 4.0, 101, 25.0)])
+@pytest.mark.parametrize(
+    ("step", "slower", "frames", "fps"), [(0.01, 1.0, 26, 25.0), (0.01, 4.0, 101, 25.0)]
+)
 def test_a_trail_ends_where_the_point_is(step, slower, frames, fps):
     shown = bodies(step, 101)
     scene = shown.film(slower)
@@ -176,7 +221,10 @@ def test_a_trail_ends_where_the_point_is(step, slower, frames, fps):
     assert scene.fps == pytest.approx(fps)
     assert (scene.texts[0], scene.texts[-1]) == ("0.00 s", "1.00 s")
     sysid, resphys = scene.views
-    assert sysid.legend == [("SysID, open loop", TONES["sysid"].light), ("path", TONES["muted"].light)]
+    assert sysid.legend == [
+        ("SysID, open loop", TONES["sysid"].light),
+        ("path", TONES["muted"].light),
+    ]
     assert resphys.legend == [("ResPhys, receding horizon", TONES["resphys"].light)]
     for view, points in zip(scene.views, shown.points.values(), strict=True):
         body, _, path, trail, ball, *drawing = view.layers
@@ -184,7 +232,8 @@ def test_a_trail_ends_where_the_point_is(step, slower, frames, fps):
         np.testing.assert_allclose(ball.points[:, 0], every)
         np.testing.assert_allclose(trail.points[:, -1], every)
         np.testing.assert_allclose(trail.points[:, 0], points[0] + 0.0 * every)
-        assert (np.diff(trail.points[..., 0], axis=1) >= 0.0).all()  # Nothing beyond where the point is.
+        # Nothing beyond where the point is.
+        assert (np.diff(trail.points[..., 0], axis=1) >= 0.0).all()
         np.testing.assert_allclose(trail.points[-1, -2:], points[[-1, -1]])
         np.testing.assert_allclose(body.points[:, 0], every)
         for layer in (path, trail, *drawing):
@@ -204,5 +253,7 @@ def test_the_drawing_is_the_path_enlarged_beside_the_body():
             for small, large in ((path, larger_path), (trail, larger_trail))
         ]
         assert factors[0] == pytest.approx(factors[1])
-        np.testing.assert_allclose(larger_ball[-1] - larger_path[0], factors[0] * (ball[-1] - path[0]), atol=1e-9)
+        np.testing.assert_allclose(
+            larger_ball[-1] - larger_path[0], factors[0] * (ball[-1] - path[0]), atol=1e-9
+        )
         assert larger_path[:, 1].min() > body[:, 1].max()  # A body that lies has it above.

@@ -24,14 +24,18 @@ from warp_resphys.report.wording import MODELS, TONES
 TIMES = np.arange(20) * 0.01
 MEASURED = np.zeros((20, 1, 3))
 MEASURED[:, 0, 2] = 0.01 * np.sin(30.0 * TIMES)
-CANVAS = SimpleNamespace(figure=lambda name, figure, alt, caption: figure, rendered=lambda *arguments: None)
+CANVAS = SimpleNamespace(
+    figure=lambda name, figure, alt, caption: figure, rendered=lambda *arguments: None
+)
 
 
 def trials_of(target, positions, times=TIMES, labels=("A",)):
     """One trial of some models, whose markers begin at zero."""
     shown = {model: q[None] for model, q in positions.items()}
     zeros = np.zeros(target.shape[1:])
-    return TrialResults(("a",), labels, ("released",), times[None], target[None], shown, zeros, zeros, 0.01)
+    return TrialResults(
+        ("a",), labels, ("released",), times[None], target[None], shown, zeros, zeros, 0.01
+    )
 
 
 def paths_of(positions, target=MEASURED, times=TIMES, bands=(), driven=None):
@@ -54,7 +58,9 @@ def test_a_logarithmic_axis_has_enough_labels(errors, labels):
     use_logarithm(axes)
     axes.figure.canvas.draw()
     low, high = axes.get_ylim()
-    inside = [tick.get_text() for tick in axes.get_yticklabels() if low <= tick.get_position()[1] <= high]
+    inside = [
+        tick.get_text() for tick in axes.get_yticklabels() if low <= tick.get_position()[1] <= high
+    ]
     assert inside == labels
 
 
@@ -81,7 +87,9 @@ def test_the_tip_is_the_mean_of_its_vertices():
 class TestErrors:
     def test_a_model_without_error_does_not_hide_the_others(self):
         rows = np.full((2, 5), 0.5)
-        (axes,) = error_over_time({"simulation": rows, "resphys": 0.0 * rows}, 0.01 * np.arange(5)).axes
+        (axes,) = error_over_time(
+            {"simulation": rows, "resphys": 0.0 * rows}, 0.01 * np.arange(5)
+        ).axes
         low, high = axes.get_ylim()
         assert axes.get_yscale() == "log"
         assert low <= 0.5 <= high
@@ -114,7 +122,9 @@ def test_one_epoch_is_seen_and_named_by_a_whole_number_and_the_start_that_was_ke
     assert all(line.get_marker() == "." for line in (*losses.lines, *rate.lines))
     low, high = rate.get_xlim()
     assert [tick for tick in rate.get_xticks() if low <= tick <= high] == [1.0]
-    histories = {"sysid": [[{"loss": 1.0}, {"loss": 3.0}, {"loss": 0.5}], [{"loss": 2.0}, {"loss": 0.1}], []]}
+    histories = {
+        "sysid": [[{"loss": 1.0}, {"loss": 3.0}, {"loss": 0.5}], [{"loss": 2.0}, {"loss": 0.1}], []]
+    }
     (axes,) = loss_histories(histories).axes
     assert [line.get_color() for line in axes.lines] == [TONES["muted"].light, TONES["sysid"].light]
     np.testing.assert_allclose(axes.lines[0].get_ydata(), [1.0, 1.0, 0.5])
@@ -135,9 +145,13 @@ class TestMotion:
         (axes,) = figure.axes  # Nothing moves along x and y.
         (band,) = axes.collections
         corners = band.get_paths()[0].vertices
-        for time, middle, width in zip(TIMES, 1.1 * MEASURED[:, 0, 2], widths["resphys"][:, 0], strict=True):
+        for time, middle, width in zip(
+            TIMES, 1.1 * MEASURED[:, 0, 2], widths["resphys"][:, 0], strict=True
+        ):
             reached = corners[np.isclose(corners[:, 0], time), 1]
-            assert [reached.min(), reached.max()] == pytest.approx([1e3 * (middle - width), 1e3 * (middle + width)])
+            assert [reached.min(), reached.max()] == pytest.approx(
+                [1e3 * (middle - width), 1e3 * (middle + width)]
+            )
 
     def test_markers_stand_over_the_pressures(self):
         times = 0.1 * np.arange(4)
@@ -146,7 +160,10 @@ class TestMotion:
         figure = paths_of({"resphys": moved}, moved, times, driven=driven)
         coordinates, inputs = figure.axes[:3], figure.axes[3:]
         assert len(inputs) == 3
-        assert all(axes.get_xlim() == below.get_xlim() for axes, below in zip(coordinates, inputs, strict=True))
+        assert all(
+            axes.get_xlim() == below.get_xlim()
+            for axes, below in zip(coordinates, inputs, strict=True)
+        )
         measured_line, model_line = coordinates[2].lines
         np.testing.assert_allclose(measured_line.get_ydata(), [0.0, 1.0, 2.0, 3.0], atol=1e-12)
         assert model_line.get_color() == TONES["resphys"].light
@@ -158,8 +175,16 @@ class TestInputs:
         """Figures of the section on the inputs."""
         trials = SimpleNamespace(names=tested, time_step=0.5, labels=())
         mesh = box_hexahedra(divisions=(1, 1, 1))
-        shape = {"mesh": mesh, "fixed": [], "chambers": (), "tendons": {}, "obstacles": ObstacleSurface()}
-        return body_section(SimpleNamespace(trials=trials, driven=driven, **shape), CANVAS).blocks[1:]
+        shape = {
+            "mesh": mesh,
+            "fixed": [],
+            "chambers": (),
+            "tendons": {},
+            "obstacles": ObstacleSurface(),
+        }
+        return body_section(SimpleNamespace(trials=trials, driven=driven, **shape), CANVAS).blocks[
+            1:
+        ]
 
     def test_pressures_are_in_kilopascal_in_the_chambers_colours(self):
         pressure = np.array([[0.0, 1e3], [2e4, 3e3]])
@@ -170,28 +195,49 @@ class TestInputs:
         assert [line.get_ydata()[0] for line in first.lines] == [20.0]
         np.testing.assert_allclose(first.patches[1].get_data().values, [1.0, 3.0])
         np.testing.assert_allclose(first.patches[1].get_data().edges, [0.0, 0.5, 1.0])
-        assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "two", "limit"]
-        assert [line.get_color() for line in figure.legends[0].get_lines()[:2]] == list(CHAMBER_COLOURS[:2])
+        assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+            "one",
+            "two",
+            "limit",
+        ]
+        assert [line.get_color() for line in figure.legends[0].get_lines()[:2]] == list(
+            CHAMBER_COLOURS[:2]
+        )
 
     def test_those_of_poses_are_bars_of_the_chambers_in_use_and_not_drawn_over_time(self):
-        poses = {"a": np.array([[9e3, 0.0, 1e3]]), "b": np.array([[0.0, 0.0, 0.0], [3e3, 0.0, 5e3]])}
-        (figure,) = self.figures_of(Driven(PRESSURE, ("one", "two", "three"), poses, 2e4, poses=("a", "b")), "b")
+        poses = {
+            "a": np.array([[9e3, 0.0, 1e3]]),
+            "b": np.array([[0.0, 0.0, 0.0], [3e3, 0.0, 5e3]]),
+        }
+        (figure,) = self.figures_of(
+            Driven(PRESSURE, ("one", "two", "three"), poses, 2e4, poses=("a", "b")), "b"
+        )
         (axes,) = figure.axes
         assert axes.get_xlabel() == "pressure [kPa]"
         assert [tick.get_text() for tick in axes.get_yticklabels()] == ["a", "b (test)"]
         assert [bar.get_width() for bar in axes.patches] == [9.0, 3.0, 1.0, 5.0]
-        assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "three", "limit"]
+        assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+            "one",
+            "three",
+            "limit",
+        ]
         assert [line.get_xdata()[0] for line in axes.lines] == [20.0]
         rows, trials = np.ones((3, 1)), SimpleNamespace(names=("b", "q"))
-        driven = Driven(PRESSURE, ("one",), {"p": rows, "a": rows, "b": rows, "q": rows}, poses=("p", "q"))
-        assert list(input_sequences(driven, trials)) == ["a, a trial of the training", "b, a test trial"]
+        driven = Driven(
+            PRESSURE, ("one",), {"p": rows, "a": rows, "b": rows, "q": rows}, poses=("p", "q")
+        )
+        assert list(input_sequences(driven, trials)) == [
+            "a, a trial of the training",
+            "b, a test trial",
+        ]
         assert input_sequences(replace(driven, poses=tuple("pabq")), trials) == {}
 
 
 def test_followed_paths_are_drawn_in_their_plane():
     path = np.stack([np.linspace(0.0, 0.02, 5), np.zeros(5), np.linspace(0.0, 0.01, 5)], axis=1)
     paths = [
-        FollowedPath(name=name, seconds=2.0, path=path, points={"open_sysid": 1.1 * path}) for name in ("line", "bow")
+        FollowedPath(name=name, seconds=2.0, path=path, points={"open_sysid": 1.1 * path})
+        for name in ("line", "bow")
     ]
     with figures.in_style():
         figure = followed_paths(paths, {"open_sysid": "SysID"}, np.eye(3)[[0, 2]])
@@ -202,12 +248,25 @@ def test_followed_paths_are_drawn_in_their_plane():
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["line", "bow"]
 
 
-# Colours as they look without each kind of cone, for linear RGB (Machado, Oliveira and Fernandes 2009, severity 1).
+# Colours as they look without each kind of cone, for linear RGB (Machado, Oliveira and Fernandes
+# 2009, severity 1).
 CONES = {
     "all": np.eye(3),
-    "no long": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
-    "no middle": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
-    "no short": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+    "no long": [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    "no middle": [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881],
+    ],
+    "no short": [
+        [1.255528, -0.076749, -0.178779],
+        [-0.078411, 0.930809, 0.147602],
+        [0.004733, 0.691367, 0.303900],
+    ],
 }
 TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 
@@ -224,10 +283,19 @@ def lab(colour, cones):
 def test_lines_of_models_differ_by_colour_or_dashes_also_with_colour_blindness(theme):
     def apart(one, other):
         colours = [getattr(TONES[model], theme) for model in (one, other)]
-        return min(np.linalg.norm(lab(colours[0], cones) - lab(colours[1], cones)) for cones in CONES.values())
+        return min(
+            np.linalg.norm(lab(colours[0], cones) - lab(colours[1], cones))
+            for cones in CONES.values()
+        )
 
-    solid = [model for model in MODELS if figures.model_line(model)["linestyle"] == "-" and model != "reconstruction"]
+    solid = [
+        model
+        for model in MODELS
+        if figures.model_line(model)["linestyle"] == "-" and model != "reconstruction"
+    ]
     assert {"simulation", "law", "actuator", "resphys"} <= {*solid}
     assert {pair for pair in combinations(solid, 2) if apart(*pair) < 10.0} == set()
-    assert {model for model in MODELS if model != "actuator" and apart("actuator", model) < 15.0} == set()
+    assert {
+        model for model in MODELS if model != "actuator" and apart("actuator", model) < 15.0
+    } == set()
     assert apart("simulation", "actuator") > 30.0

@@ -1,4 +1,6 @@
-"""The identified law on the page: its section, its stress, and trials outside of the training loads."""
+"""The identified law on the page: its section, its stress,
+and trials outside of the training loads.
+"""
 
 from types import SimpleNamespace
 
@@ -21,7 +23,15 @@ from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.learning import LawSettings
 
 OTHER = "0.12 <kg>"
-TERMS = {"c10": 30e3, "c20": 4e3, "c01": 6e3, "c02": 2e3, "bulk_1": 2e6, "bulk_2": 1e6, "dilation": 5e3}
+TERMS = {
+    "c10": 30e3,
+    "c20": 4e3,
+    "c01": 6e3,
+    "c02": 2e3,
+    "bulk_1": 2e6,
+    "bulk_2": 1e6,
+    "dilation": 5e3,
+}
 TERMS |= {"ogden_4": 20e3, "ogden_m3": 5e3}
 FIBRES = {"tension": 50e3, "slack": 0.01, "toe": 0.02, "stiffening": 10e3, "compression": 8e3}
 FIBRES = {f"fibre_{name}_1": value for name, value in FIBRES.items()} | {"fibre_elevation_1": 0.0}
@@ -34,20 +44,48 @@ def errors_on(trials, error, below):
 
 def law(**changes):
     """Content of law.json, and what metrics.json adds."""
-    parameters = {"c10": 40e3, "bulk_1": 7e6, "ogden_3": 8e3, "prony_modulus_1": 20e3, "prony_time_1": 0.08}
+    parameters = {
+        "c10": 40e3,
+        "bulk_1": 7e6,
+        "ogden_3": 8e3,
+        "prony_modulus_1": 20e3,
+        "prony_time_1": 0.08,
+    }
     own = {
         "model": "law",
         "accepted": True,
         "groups": ["elastic", "branches"],
         "parameters": parameters,
-        "units": {"c10": "Pa", "bulk_1": "Pa", "ogden_3": "Pa", "prony_modulus_1": "Pa", "prony_time_1": "s"},
+        "units": {
+            "c10": "Pa",
+            "bulk_1": "Pa",
+            "ogden_3": "Pa",
+            "prony_modulus_1": "Pa",
+            "prony_time_1": "s",
+        },
         "others": {},
-        "deviation": {"c10": 400.0, "bulk_1": 6.5e6, "ogden_3": 100.0, "prony_modulus_1": 10.0, "prony_time_1": 1e-3},
+        "deviation": {
+            "c10": 400.0,
+            "bulk_1": 6.5e6,
+            "ogden_3": 100.0,
+            "prony_modulus_1": 10.0,
+            "prony_time_1": 1e-3,
+        },
         "at_bounds": ["prony_time_1"],
         "validation": errors_on(["80 g", "180 g"], 4.9e-5, 0.1025),
         "classes": [
-            {"groups": [], "parameters": {"c10": 44e3, "bulk_1": 7e6}, "residual": 0.02, "validation": None},
-            {"groups": ["elastic", "branches"], "parameters": parameters, "residual": 0.003, "validation": 1.2e-4},
+            {
+                "groups": [],
+                "parameters": {"c10": 44e3, "bulk_1": 7e6},
+                "residual": 0.02,
+                "validation": None,
+            },
+            {
+                "groups": ["elastic", "branches"],
+                "parameters": parameters,
+                "residual": 0.003,
+                "validation": 1.2e-4,
+            },
         ],
         "data": {"name": "own", "trials": ["0.05 kg"]},
         "against": "simulation",
@@ -68,7 +106,10 @@ def run(folder, own, **more):
 @pytest.mark.usefixtures("no_drawing")
 def test_page_has_the_law_and_the_errors_by_load(tmp_path):
     page = run(tmp_path, law())
-    means = {row["name"]: row["errors_mm"] for row in read_json(tmp_path / "errors.json")["per_trajectory"]}
+    means = {
+        row["name"]: row["errors_mm"]
+        for row in read_json(tmp_path / "errors.json")["per_trajectory"]
+    }
     inside, outside = (number_text(means[name]["law"]) for name in ("0.07 kg", OTHER))
     assert inside != outside
     page.says(
@@ -91,7 +132,10 @@ def test_page_has_the_law_and_the_errors_by_load(tmp_path):
 @pytest.mark.usefixtures("no_figures")
 def test_a_law_that_is_not_used_is_said_to_be_so(tmp_path):
     page = run(tmp_path, law(accepted=False, validation=errors_on(["80 g"], 0.2, 0.1)))
-    said = "The identified law is not used: its root mean square error on the validation trials (80 g) is 20 %"
+    said = (
+        "The identified law is not used: "
+        "its root mean square error on the validation trials (80 g) is 20 %"
+    )
     assert said in page.text
     assert "with the law" not in page.text
     assert "failed" in law_section.law_text(law(validation=errors_on(["0.05 kg"], 0.1, None)))
@@ -103,7 +147,9 @@ def test_a_law_that_its_own_run_did_not_use_and_terms_that_it_does_not_have_are_
     assert law_section.law_text({**given, "accepted_there": False}).endswith(
         "did not use it: it was not clearly closer there."
     )
-    assert "viscosity in volume and fibres." in law_section.not_needed_text(law(), LawSettings(terms=()))
+    assert "viscosity in volume and fibres." in law_section.not_needed_text(
+        law(), LawSettings(terms=())
+    )
     assert law_section.wording("ogden_m3")[0][0] == "Ogden's term of exponent -3"
 
 
@@ -114,25 +160,48 @@ def test_where_the_force_fades_out_the_law_remains_and_stretches_beyond_the_trai
     assert table.note.endswith("fades out, and the law remains.")
     stretches = {"all test trials": (0.7, 1.4), "the training": (0.9, 1.1)}
     metrics = {"law": {}}
-    said = law_section.outside_text(SimpleNamespace(outside=0.123, stretches=stretches, metrics=metrics))
-    assert said.startswith("In 12 % of the cells and times of all test trials, a principal stretch lies outside of ")
+    said = law_section.outside_text(
+        SimpleNamespace(outside=0.123, stretches=stretches, metrics=metrics)
+    )
+    assert said.startswith(
+        "In 12 % of the cells and times of all test trials, a principal stretch lies outside of "
+    )
     assert said.endswith("0.90 to 1.10: there it extrapolates.")
     metrics["law"]["modes"] = ["tension", "shear"]
-    said = law_section.outside_text(SimpleNamespace(outside=0.123, stretches=stretches, metrics=metrics))
-    assert said.endswith("0.90 to 1.10 in tension and shear, or the load is another one: there it extrapolates.")
+    said = law_section.outside_text(
+        SimpleNamespace(outside=0.123, stretches=stretches, metrics=metrics)
+    )
+    assert said.endswith(
+        "0.90 to 1.10 in tension and shear, or the load is another one: there it extrapolates."
+    )
     assert law_section.outside_text(SimpleNamespace(outside=0.001, stretches=stretches)) == ""
     assert law_section.outside_text(SimpleNamespace(outside=None, stretches={})) == ""
 
 
 def test_a_class_is_named_with_the_viscosity_that_its_law_has():
-    tried = [{"groups": ["elastic"], "parameters": {"c10": 1e4, "bulk_viscosity": x}} for x in (0.0, 200.0)]
+    tried = [
+        {"groups": ["elastic"], "parameters": {"c10": 1e4, "bulk_viscosity": x}}
+        for x in (0.0, 200.0)
+    ]
     (table,) = law_section._classes({"groups": ["elastic"], "classes": tried})
-    assert [row.head for row in table.rows] == ["With elastic terms", "With elastic terms and viscosity"]
+    assert [row.head for row in table.rows] == [
+        "With elastic terms",
+        "With elastic terms and viscosity",
+    ]
 
 
 def test_a_term_with_the_coefficient_zero_is_not_listed():
-    parameters = {"c10": 4e4, "c20": 0.0, "shear_viscosity": 0.0, "fibre_azimuth_1": 0.0, "fibre_slack_1": 0.0}
-    content = {"parameters": parameters, "deviation": {"c10": 1.0, "c20": 1.0, "fibre_azimuth_1": 0.1}}
+    parameters = {
+        "c10": 4e4,
+        "c20": 0.0,
+        "shear_viscosity": 0.0,
+        "fibre_azimuth_1": 0.0,
+        "fibre_slack_1": 0.0,
+    }
+    content = {
+        "parameters": parameters,
+        "deviation": {"c10": 1.0, "c20": 1.0, "fibre_azimuth_1": 0.1},
+    }
     heads = [row.head for row in law_section._terms_table(content).rows]
     assert heads == ["Neo-Hookean term", "Fibres 1: azimuth"]  # An angle may be zero.
     said = law_section.not_needed_text(content, LawSettings(terms=["c20", "c01"], families=0))
@@ -141,11 +210,16 @@ def test_a_term_with_the_coefficient_zero_is_not_listed():
 
 @pytest.mark.parametrize("direction", [None, ALONG, ACROSS])
 def test_stress_is_that_of_the_simulated_law(direction):
-    """At stretches with free sides, the kernels' stress is along the load alone, and has the value of the curve."""
+    """At stretches with free sides, the kernels' stress is along the load alone,
+    and has the value of the curve.
+    """
     azimuth = 0.0 if direction in (None, ALONG) else np.pi / 2.0
     parameters = {**TERMS, **({} if direction is None else {**FIBRES, "fibre_azimuth_1": azimuth})}
     material = ConvexMaterial.from_parameters(parameters)
-    own = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in material.values.items()}
+    own = {
+        name: torch.tensor([[value]], dtype=torch.float64)
+        for name, value in material.values.items()
+    }
     law_of, module = material.law, wp.get_module(f"test_law.{material.law.name}")
     moduli = law_of.values(*(float(modulus) for modulus in material.moduli(own)))
 
@@ -156,7 +230,9 @@ def test_stress_is_that_of_the_simulated_law(direction):
 
     for stretch in (0.85, 1.25):
         (found,) = uniaxial_stress(parameters, np.array([stretch]), direction)
-        sides = scipy.optimize.root(lambda s, x=stretch: stresses(stress_of, moduli, x, s)[1:], np.ones(2)).x
+        sides = scipy.optimize.root(
+            lambda s, x=stretch: stresses(stress_of, moduli, x, s)[1:], np.ones(2)
+        ).x
         expected = stresses(stress_of, moduli, stretch, sides)
         assert np.abs(expected[1:]).max() < 1e-6 * abs(expected[0])
         assert found == pytest.approx(expected[0], rel=1e-6)
@@ -176,7 +252,9 @@ def test_moduli_at_small_strains():
     step = 1e-5
     low, high = uniaxial_stress(TERMS, np.array([1.0 - step, 1.0 + step]))
     assert (high - low) / (2.0 * step) == pytest.approx(moduli.youngs_modulus, rel=1e-6)
-    hookean = MaterialSettings(model="stable_neo_hookean", youngs_modulus=264e3, poissons_ratio=0.45)
+    hookean = MaterialSettings(
+        model="stable_neo_hookean", youngs_modulus=264e3, poissons_ratio=0.45
+    )
     found = law_section.small_strain_of(hookean)
     assert (found.youngs_modulus, found.poissons_ratio) == pytest.approx((264e3, 0.45))
     assert law_section.small_strain_of(MaterialSettings(model="law", **TERMS)) == moduli

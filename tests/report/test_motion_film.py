@@ -7,11 +7,23 @@ import numpy as np
 import torch
 
 from support.refusals import refuses
-from warp_resphys import Body, Corotated, InputError, Motion, Scene, Simulator, State, box_hexahedra, film
+from warp_resphys import (
+    Body,
+    Corotated,
+    InputError,
+    Motion,
+    Scene,
+    Simulator,
+    State,
+    box_hexahedra,
+    film,
+)
 
 
 def test_a_film_shows_all_bodies_of_a_motion(tmp_path, can_draw):
-    """Two boxes side by side, of which one rises: the blue moves up in the right half of the picture."""
+    """Two boxes side by side, of which one rises: the blue moves up
+    in the right half of the picture.
+    """
     box = Body(box_hexahedra((0.02, 0.02, 0.02), (1, 1, 1)))
     scene = Scene({"left": box, "right": box.moved(np.eye(3), (0.06, 0.0, 0.0))})
     rest = Simulator(scene, {"left": Corotated(), "right": Corotated()}).rest_state()
@@ -19,12 +31,18 @@ def test_a_film_shows_all_bodies_of_a_motion(tmp_path, can_draw):
     lifted[:, 8:, 2] += 0.02
     states = [rest, rest, rest, replace(rest, q=lifted)]
     motion = Motion.of(states, scene, 0.05)
-    frames = imageio_ffmpeg.read_frames(str(film(motion, tmp_path / "boxes.mp4", gravity=(0.0, 0.0, -9.81))))
+    frames = imageio_ffmpeg.read_frames(
+        str(film(motion, tmp_path / "boxes.mp4", gravity=(0.0, 0.0, -9.81)))
+    )
     width, height = next(frames)["size"]
-    pictures = [np.frombuffer(one, np.uint8).reshape(height, width, 3).astype(int) for one in frames]
+    pictures = [
+        np.frombuffer(one, np.uint8).reshape(height, width, 3).astype(int) for one in frames
+    ]
     heights = []
     for picture in (pictures[0], pictures[-1]):
-        blue = (picture[..., 2] > picture[..., 0] + 40) & (np.arange(height)[:, None] > 0.1 * height)
+        blue = (picture[..., 2] > picture[..., 0] + 40) & (
+            np.arange(height)[:, None] > 0.1 * height
+        )
         halves = blue[:, : width // 2], blue[:, width // 2 :]
         assert all(half.sum() > 500 for half in halves)
         heights.append([np.argwhere(half)[:, 0].mean() for half in halves])

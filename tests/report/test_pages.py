@@ -9,7 +9,15 @@ import pytest
 
 from support import made_up_run
 from support.chambered import hollow_box
-from support.made_up_run import ARM_MODELS, BEAM, BEAM_MODELS, TRACKED, TRIALS, arm_settings, write_arm_run
+from support.made_up_run import (
+    ARM_MODELS,
+    BEAM,
+    BEAM_MODELS,
+    TRACKED,
+    TRIALS,
+    arm_settings,
+    write_arm_run,
+)
 from support.refusals import refuses
 from support.report_page import report
 from warp_resphys import DataFileError, Mesh, box_hexahedra
@@ -46,23 +54,34 @@ class TestArms:
         for model in ARM_MODELS:
             assert f"{number_text(errors['errors_mm'][model]['mean'])} ± " in page.text
             assert number_text(errors["per_marker"][model]["Arm - 7"]) in page.text
-            assert all(number_text(row["errors_mm"][model]) in page.text for row in errors["per_trajectory"])
+            assert all(
+                number_text(row["errors_mm"][model]) in page.text
+                for row in errors["per_trajectory"]
+            )
         page.says(
             *("7.31 ± 3.54", "No recordings are configured"),
-            *("The noise of the markers alone is 0.08 mm.", "of 0.120 mm from the observed ones, 0.610 mm at most"),
+            "The noise of the markers alone is 0.08 mm.",
+            "of 0.120 mm from the observed ones, 0.610 mm at most",
             "mean over 3 test trials of 4 s and 12 markers",
             "SimFree2 of 3after 0.84 s (test_00)",
-            *("dashed, the limit of 20 kPa", "Young's modulus [kPa]264237250", "1 min 15 s", "no OpenGL here"),
+            "dashed, the limit of 20 kPa",
+            "Young's modulus [kPa]264237250",
+            "1 min 15 s",
+            "no OpenGL here",
         )
         page.lacks("Longer than the training", "A line ends", "±  is")
         assert figures_in(tmp_path) == FIGURES_OF_AN_ARM
 
     @pytest.mark.usefixtures("no_figures")
     def test_longer_rollouts_of_which_one_diverged(self, tmp_path):
-        settings = arm_settings("data.folder=recordings", "data.train_fraction=0.5", name="sopra_extrapolation")
+        settings = arm_settings(
+            "data.folder=recordings", "data.train_fraction=0.5", name="sopra_extrapolation"
+        )
         write_arm_run(tmp_path, settings, horizons=(1, 2), diverged=("simfree",), simulated=False)
         page = report(tmp_path, settings)
-        page.says("Longer than the training", "First 1 s", "A line ends", "of 494 vertices", "9.89 ± 5.02")
+        page.says(
+            "Longer than the training", "First 1 s", "A line ends", "of 494 vertices", "9.89 ± 5.02"
+        )
         assert page.text.count("1 of 3 diverged") == 3
         assert "No recordings are configured" not in page.text
 
@@ -79,21 +98,32 @@ class TestArms:
         assert better.metrics["recommended"] == "sysid"
         assert [*motion_of(better).positions] == ["simulation", "sysid"]
         without = RunReader(tmp_path, ARM.changed(reconstruction=None)).report()
-        assert "resphys" not in {**without.trials.positions, **without.film.positions, **without.metrics["errors_mm"]}
+        assert "resphys" not in {
+            **without.trials.positions,
+            **without.film.positions,
+            **without.metrics["errors_mm"],
+        }
 
     @pytest.mark.usefixtures("no_figures")
     def test_higher_pressures(self, tmp_path):
         settings = arm_settings("data.input_scales=[1.25,1.75]", name="sopra_overpressure")
         write_arm_run(tmp_path, settings, test=2, scales=(1.25, 1.75))
-        text, scales = report(tmp_path, settings).text, read_json(tmp_path / "errors.json")["scales"]
-        assert all(number_text(scales[f][m]["mean"]) in text for f in ("1", "1.25", "1.75") for m in ARM_MODELS)
+        text = report(tmp_path, settings).text
+        scales = read_json(tmp_path / "errors.json")["scales"]
+        assert all(
+            number_text(scales[f][m]["mean"]) in text
+            for f in ("1", "1.25", "1.75")
+            for m in ARM_MODELS
+        )
         assert "none of 22 of 2after 0.40 s" in text
         read = RunReader(tmp_path, settings)
         trials, pressures = read.trials, read.driven
         assert trials.names == ("test_00", "test_01")
         assert len(pressures.scaled) == 4
         assert set(pressures.scaled) < pressures.values.keys()
-        assert trials.errors_mm["resphys"][:, 1:].mean() == pytest.approx(scales["1"]["resphys"]["mean"], rel=1e-5)
+        assert trials.errors_mm["resphys"][:, 1:].mean() == pytest.approx(
+            scales["1"]["resphys"]["mean"], rel=1e-5
+        )
 
     @pytest.mark.usefixtures("no_figures")
     def test_one_chamber_one_trial_and_two_models(self, tmp_path):
@@ -101,8 +131,13 @@ class TestArms:
         turned = box.vertices[:, [2, 1, 0]] * [1.0, 1.0, -1.0] - [0.01, 0.015, 0.0]
         write_mesh(tmp_path / "box.vtk", Mesh(turned, box.cells))
         settings = arm_settings(
-            *("mesh=file", f"mesh.path={tmp_path / 'box.vtk'}", "mesh.drop_unreferenced=true", "chambers.count=2"),
-            *("markers.tracked=null", "+markers.tracked={Tip:[0.0,0.01,-0.06]}", "data.folder=recordings"),
+            "mesh=file",
+            f"mesh.path={tmp_path / 'box.vtk'}",
+            "mesh.drop_unreferenced=true",
+            "chambers.count=2",
+            "markers.tracked=null",
+            "+markers.tracked={Tip:[0.0,0.01,-0.06]}",
+            "data.folder=recordings",
             *("data.input_limit=null", "tip={z:-0.06}"),
             name="segment_real",
         )
@@ -113,11 +148,15 @@ class TestArms:
             *("ResPhys diverged in 1 of 1 trials; ", "1 test trial of 2 s and 1 marker"),
             *("Pressures of the trial.", "ResPhysnone of 1", "data.input_limitnull"),
         )
-        page.lacks("SysID", "Published", "The published", "Identification", "dashed", "median filter")
+        page.lacks(
+            "SysID", "Published", "The published", "Identification", "dashed", "median filter"
+        )
         without = {"loss_history", "training_simfree", "paths_best"}
         assert figures_in(tmp_path) == FIGURES_OF_AN_ARM - without
 
-    @pytest.mark.parametrize("name", ["dataset.h5", "rollouts.h5", "errors.json", "registration.json"])
+    @pytest.mark.parametrize(
+        "name", ["dataset.h5", "rollouts.h5", "errors.json", "registration.json"]
+    )
     def test_a_missing_file_is_one_sentence(self, tmp_path, name):
         write_arm_run(tmp_path, ARM, test=1, steps=40, models=("resphys",))
         (tmp_path / name).unlink()
@@ -129,10 +168,18 @@ class TestArms:
         other = tmp_path / "other"
         write_arm_run(other, ARM, test=3, steps=40, models=("resphys",))
         (other / "rollouts.h5").replace(tmp_path / "rollouts.h5")
-        with pytest.raises(DataFileError, match=r"rollouts.h5 names trials that .* does not hold \(test_02\)"):
+        with pytest.raises(
+            DataFileError, match=r"rollouts.h5 names trials that .* does not hold \(test_02\)"
+        ):
             _ = RunReader(tmp_path, ARM).trials
         write_arm_run(tmp_path, ARM, test=2, steps=40, models=("resphys",), chambers=7)
-        refuses(DataFileError, "pressures of chamber_7, but the body's chambers are chamber_1, ", report, tmp_path, ARM)
+        refuses(
+            DataFileError,
+            "pressures of chamber_7, but the body's chambers are chamber_1, ",
+            report,
+            tmp_path,
+            ARM,
+        )
 
     def test_what_is_read(self, tmp_path):
         write_arm_run(tmp_path, ARM, diverged=("simfree",))
@@ -144,7 +191,9 @@ class TestArms:
         assert np.isinf(trials.errors_mm["simfree"][0, 60:]).all()
         expected = read_json(tmp_path / "errors.json")["errors_mm"]
         for model in ("sysid", "resphys"):
-            assert trials.errors_mm[model][:, 1:].mean() == pytest.approx(expected[model]["mean"], rel=1e-5)
+            assert trials.errors_mm[model][:, 1:].mean() == pytest.approx(
+                expected[model]["mean"], rel=1e-5
+            )
         assert film.positions["resphys"].shape[0] == len(film.times) == 51
         assert list(pressures.values) == ["train_00", "train_01", "test_00", "test_01", "test_02"]
         assert pressures.values["test_00"].shape == (100, 6)
@@ -169,7 +218,9 @@ class TestArms:
         monkeypatch.setattr(run_page, "write_report", lambda _, data: shown.append(data))
         stage.make_report(StageContext("report", tmp_path, "", ARM))
         (page_data,) = shown
-        sagged = page_data.mesh.vertices[:, 2].min() - page_data.recordings.mesh.vertices[:, 2].min()
+        sagged = (
+            page_data.mesh.vertices[:, 2].min() - page_data.recordings.mesh.vertices[:, 2].min()
+        )
         assert sagged == pytest.approx(0.004, abs=1e-6)
         nominal = {label: place[2] for label, place in page_data.recordings.nominal.items()}
         assert nominal["Base - 1"] == ARM.markers.reference["Base - 1"][2]
@@ -187,15 +238,24 @@ class TestBeams:
         for model in BEAM_MODELS:
             assert number_text(errors["errors_mm"][model]["mean"]) in page.text
             assert number_text(errors["per_marker"][model]["Tip - 2"]) in page.text
-            assert all(number_text(row["errors_mm"][model]) in page.text for row in errors["per_trajectory"])
+            assert all(
+                number_text(row["errors_mm"][model]) in page.text
+                for row in errors["per_trajectory"]
+            )
         assert "No recordings are configured" not in page.text
         page.says(
             "Trials: two trials are no evidence; test on five or more.",
-            *("5.46 ± 1.78", "251.3 ± 2.5", "stable neo hookean", "left out", "1 min 35 s", "no OpenGL here"),
+            "5.46 ± 1.78",
+            "251.3 ± 2.5",
+            "stable neo hookean",
+            "left out",
+            "1 min 35 s",
+            "no OpenGL here",
             "Young's modulus and Poisson's ratio (correlation \N{MINUS SIGN}0.96)",
             "bare: Base - 1 jumps once, by 0.31 mm, in frame 80.",
             "Trial load52, in which the last model of the table has its largest error",
-            "The band should contain 90 % of the measured coordinates, and contains 87 % of them; it is ± 3.00 mm",
+            "The band should contain 90 % of the measured coordinates, and contains 87 % of "
+            "them; it is ± 3.00 mm",
         )
         learned = {f"training_{model}" for model in ("simfree", "resphys_uncorrected", "resphys")}
         others = {"error_over_time", "loss_history", "paths_worst", "paths_best"}
@@ -203,14 +263,23 @@ class TestBeams:
 
     @pytest.mark.usefixtures("no_figures")
     def test_what_is_not_there_is_left_out_and_what_diverged_is_said(self, tmp_path):
-        made_up_run.write_beam_run(tmp_path, "bare", "load52", models=("simulation", "resphys"), diverged=("resphys",))
+        made_up_run.write_beam_run(
+            tmp_path, "bare", "load52", models=("simulation", "resphys"), diverged=("resphys",)
+        )
         for name in ("identification.json", "training_resphys.json", "truth.json"):
             (tmp_path / name).unlink()
         page = report(tmp_path, BEAM.changed(name="my_robot", data=BEAM.data.changed(folder=None)))
         assert page.text.count("1 of 2 diverged") == 2
         page.says("ResPhys diverged in 1 of 2 trials", "No recordings are configured")
         page.says("A line ends where the first roll-out has diverged.")
-        page.lacks("SysID", "SimFree", "Published", "Identification", "Training", "Against the reconstruction")
+        page.lacks(
+            "SysID",
+            "SimFree",
+            "Published",
+            "Identification",
+            "Training",
+            "Against the reconstruction",
+        )
         assert figures_in(tmp_path) == {"error_over_time", "paths_worst", "paths_best"}
 
     @pytest.mark.usefixtures("no_figures")
@@ -219,12 +288,18 @@ class TestBeams:
             tmp_path, "bare", "load52", models=("simulation", "sysid_elastic", "sysid", "resphys")
         )
         errors = read_json(tmp_path / "errors.json")
-        for row in (errors["errors_mm"], *(trial["errors_mm"] for trial in errors["per_trajectory"])):
+        for row in (
+            errors["errors_mm"],
+            *(trial["errors_mm"] for trial in errors["per_trajectory"]),
+        ):
             row["resphys"] = row["sysid"]
         write_json(tmp_path / "errors.json", errors)
         history = read_json(tmp_path / "training_resphys.json")
         test = {**history["kept"]["test"], "error_mm": None, "below_mm": 0.5, "used": False}
-        write_json(tmp_path / "training_resphys.json", {**history, "kept": {**history["kept"], "test": test}})
+        write_json(
+            tmp_path / "training_resphys.json",
+            {**history, "kept": {**history["kept"], "test": test}},
+        )
         identified = read_json(tmp_path / "identification.json")
         identified["sysid"]["parameters"]["youngs_modulus"] = 2e6
         write_json(tmp_path / "identification.json", identified)
@@ -236,7 +311,8 @@ class TestBeams:
             "No evidence either way: 2 trials (SysID",
             "At a bound: Poisson's ratio",
             "Trials: two trials are no evidence",
-            "Not used: ResPhys, as on the validation trials (bare) it diverges, and the simulator without it has 0.5",
+            "Not used: ResPhys, as on the validation trials (bare) it diverges, and the "
+            "simulator without it has 0.5",
             f"+ identified parameters (SysID){mean}best",
         ):
             assert said in head
@@ -259,7 +335,9 @@ class TestBeams:
         assert links == [f"fold_{trial}/report.html" for trial in TRIALS]
         said = page.text
         for trial, end in (("bare", ""), ("load52", NONE)):
-            size, mean = (folds[trial]["per_trajectory"][0][key] for key in ("amplitude_mm", "errors_mm"))
+            size, mean = (
+                folds[trial]["per_trajectory"][0][key] for key in ("amplitude_mm", "errors_mm")
+            )
             assert f"{trial}amplitude {size:.3g} mm{number_text(mean['simulation'])}{end}" in said
         assert "diverged" in said[said.index("Test trial [mm]") : said.index("load52")]
         assert all(words in said for words in ("jumps once", "Root mean square"))
@@ -271,11 +349,14 @@ class TestBeams:
         assert trials.positions["resphys"].shape == trials.target.shape
         assert trials.times[0, -1] <= made_up_run.SECONDS < trials.times[0, -1] + made_up_run.STEP
         assert np.isfinite(trials.target).all()
-        whole = RunReader(tmp_path / "fold_load101", BEAM.changed(data=BEAM.data.changed(seconds=None))).trials
+        whole = RunReader(
+            tmp_path / "fold_load101", BEAM.changed(data=BEAM.data.changed(seconds=None))
+        ).trials
         assert whole.target.shape[1] == made_up_run.FRAMES
         assert np.isnan(whole.target[0, -3:]).all()
         expected = read_json(tmp_path / "fold_load101" / "errors.json")["errors_mm"]
-        for model, rows in trials.errors_mm.items():  # The markers have noise, the errors of the file have none.
+        # The markers have noise, the errors of the file have none.
+        for model, rows in trials.errors_mm.items():
             assert rows.mean() == pytest.approx(expected[model]["mean"], abs=0.1)
         hidden = RunReader(tmp_path / "fold_bare", BEAM).trials
         assert np.isnan(hidden.target[0, 9:16, 1]).all()
@@ -294,5 +375,7 @@ class TestBeams:
         made_up_run.write_beam_run(tmp_path, *TRIALS, models=("simulation", "resphys"))
         trials = RunReader(tmp_path, BEAM).trials
         assert [trials.names[row] for row in best_and_worst(trials)] == ["load101", "bare"]
-        made_up_run.write_split(tmp_path, list(TRIALS), models=("simulation", "resphys"), diverged=("resphys",))
+        made_up_run.write_split(
+            tmp_path, list(TRIALS), models=("simulation", "resphys"), diverged=("resphys",)
+        )
         assert best_and_worst(RunReader(tmp_path, BEAM).trials)[0] == 0

@@ -1,4 +1,6 @@
-"""Pictures of bodies: what is drawn where, in which colours, and what is said where nothing can be drawn."""
+"""Pictures of bodies: what is drawn where, in which colours,
+and what is said where nothing can be drawn.
+"""
 
 import sys
 from types import SimpleNamespace
@@ -24,7 +26,9 @@ VIEWER = np.asarray(TOWARDS_VIEWER) / np.linalg.norm(TOWARDS_VIEWER)
 
 def shaded(normal: tuple[float, float, float]) -> np.ndarray:
     """(3,) colour of the body on a face that looks along a normal."""
-    facing = max(0.0, float(np.dot(normal, render.TOWARDS_LIGHT) / np.linalg.norm(render.TOWARDS_LIGHT)))
+    facing = max(
+        0.0, float(np.dot(normal, render.TOWARDS_LIGHT) / np.linalg.norm(render.TOWARDS_LIGHT))
+    )
     return np.asarray(matplotlib.colors.to_rgb(BODY)) * (1.0 - SHADE * (1.0 - facing))
 
 
@@ -38,21 +42,28 @@ def share(pixels: np.ndarray, colour: np.ndarray) -> float:
 @pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES.keys())
 def test_a_body_is_drawn_whole_to_scale_and_shaded(mesh: Mesh, renderer: render.Renderer) -> None:
     # Each visible face has one colour, in the share of the picture that it covers.
-    faces = {(1.0, 0.0, 0.0): 0.03 * 0.03, (0.0, -1.0, 0.0): 0.1 * 0.03, (0.0, 0.0, 1.0): 0.1 * 0.03}  # [m²]
+    # [m²]
+    faces = {
+        (1.0, 0.0, 0.0): 0.03 * 0.03,
+        (0.0, -1.0, 0.0): 0.1 * 0.03,
+        (0.0, 0.0, 1.0): 0.1 * 0.03,
+    }
     covered = {normal: area * float(np.dot(normal, VIEWER)) for normal, area in faces.items()}
     (picture,) = render.draw(body_scene(mesh, views=2), renderer)
     pictures = np.split(picture / 255.0, 2, axis=1)
     for pixels in pictures:
         for normal, area in covered.items():
             expected = area / sum(covered.values())
-            assert share(pixels, shaded(normal)) == pytest.approx(expected, abs=0.06)  # Edges, outline.
+            # Edges, outline.
+            assert share(pixels, shaded(normal)) == pytest.approx(expected, abs=0.06)
         rows, columns = np.nonzero(pixels[..., 3] == 1.0)
         for seen, length in ((rows, pixels.shape[0]), (columns, pixels.shape[1])):
             margin = MARGIN * max(pixels.shape)
             assert seen.min() == pytest.approx(margin, abs=0.3 * margin)
             assert length - seen.max() == pytest.approx(margin, abs=0.3 * margin)
     first, second = pictures
-    assert np.mean(np.abs(first - second).max(axis=2) > 0.05) < 1e-5  # A pixel may be rounded otherwise.
+    # A pixel may be rounded otherwise.
+    assert np.mean(np.abs(first - second).max(axis=2) > 0.05) < 1e-5
 
 
 @pytest.mark.usefixtures("can_draw")

@@ -16,7 +16,14 @@ from warp_resphys.report.error_section import error_over_time
 from warp_resphys.report.wording import error_parts, number_text
 
 SETTINGS = vertex_settings()
-DRAWN = {"error_over_time", "paths_worst", "paths_best", "training_resphys", "training_simfree", "motion"}
+DRAWN = {
+    "error_over_time",
+    "paths_worst",
+    "paths_best",
+    "training_resphys",
+    "training_simfree",
+    "motion",
+}
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +61,9 @@ def test_page_says_how_far_and_stands_beside_the_published_numbers(finished):
     errors = read_json(folder / "errors.json")["errors_mm"]
     for summary in errors.values():
         assert " ".join(error_parts(summary)) in page.text
-    simulated, corrected = (number_text(errors[model]["mean"]) for model in ("simulation", "resphys"))
+    simulated, corrected = (
+        number_text(errors[model]["mean"]) for model in ("simulation", "resphys")
+    )
     page.says(
         f"uncorrected simulator{simulated}",
         f"+ learned force (ResPhys){corrected}best",
@@ -83,7 +92,9 @@ def test_a_diverged_rollout_is_said_and_does_not_hide_the_rest(tmp_path):
     stale.parent.mkdir()
     stale.write_bytes(b"of an earlier run")
     page = report(tmp_path, SETTINGS)
-    page.says("1 of 2 diverged", "ResPhys diverged in 1 of 2 trials", "the first roll-out has diverged")
+    page.says(
+        "1 of 2 diverged", "ResPhys diverged in 1 of 2 trials", "the first roll-out has diverged"
+    )
     assert "no OpenGL here" in page.text
     assert page.text.count("libegl1") == 1
     written = {path.stem for path in stale.parent.iterdir()}
@@ -105,9 +116,8 @@ def test_poses_have_no_time(tmp_path):
     write_vertex_run(tmp_path, SETTINGS, steps=0, begins="static", models=("simulation", "resphys"))
     assert "2 test trials, 1 step and" in report(tmp_path, SETTINGS).text
     assert {path.stem for path in (tmp_path / "figures").iterdir()} == {"training_resphys"}
-    write_vertex_run(
-        tmp_path, SETTINGS, steps=3, begins="static", models=("simulation", "resphys")
-    )  # As beside motions.
+    # As beside motions.
+    write_vertex_run(tmp_path, SETTINGS, steps=3, begins="static", models=("simulation", "resphys"))
     assert not RunReader(tmp_path, SETTINGS).trials.moves
 
 

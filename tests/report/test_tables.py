@@ -20,7 +20,11 @@ from warp_resphys.report import sections, wording
 from warp_resphys.report.body_motions import instants
 from warp_resphys.report.control_section import control_section
 from warp_resphys.report.data import Driven, at_times
-from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
+from warp_resphys.report.identification_section import (
+    parameter_rows,
+    placement_text,
+    uncertainty_text,
+)
 from warp_resphys.report.page import Cell, PageTable, Row
 from warp_resphys.report.pages.run_page import range_table
 from warp_resphys.report.wording import MINUS, NO_BREAK_SPACE, NONE
@@ -32,7 +36,12 @@ DOWN = np.array([0.0, 0.0, -9.8])
 
 @pytest.mark.parametrize("summary", ["", "Trial [1]"])
 def test_units_in_brackets_reach_the_terminal(summary):
-    table = PageTable("Error [mm]", ["Mean [mm]"], [Row("At rest [2]", [Cell("1.2", beside="[3]")])], summary=summary)
+    table = PageTable(
+        "Error [mm]",
+        ["Mean [mm]"],
+        [Row("At rest [2]", [Cell("1.2", beside="[3]")])],
+        summary=summary,
+    )
     console = Console(width=80, file=StringIO())
     console.print(table)
     words = console.file.getvalue().split()
@@ -41,14 +50,23 @@ def test_units_in_brackets_reach_the_terminal(summary):
 
 
 def test_a_table_that_is_too_wide_wraps_its_heads_alone():
-    table = PageTable("A long head over short rows", ["one column"], [Row("r" * 60, [Cell("4.3e-07")], "best of all")])
+    table = PageTable(
+        "A long head over short rows",
+        ["one column"],
+        [Row("r" * 60, [Cell("4.3e-07")], "best of all")],
+    )
     console = Console(width=80, file=StringIO())
     console.print(table)
     assert f"{'r' * 60}  4.3e-07  best of" in console.file.getvalue()
 
 
 def summary(mean, diverged=0):
-    return {"mean": mean, "std": None if mean is None else 0.1, "trajectories": 3, "diverged": diverged}
+    return {
+        "mean": mean,
+        "std": None if mean is None else 0.1,
+        "trajectories": 3,
+        "diverged": diverged,
+    }
 
 
 ERRORS = {"sysid": summary(2.0), "resphys": summary(1.0)}
@@ -76,23 +94,36 @@ def test_errors_are_by_horizon_and_published_ones_stand_beside_the_same_model():
 def test_control_is_told_by_controller_and_speed():
     errors = {"mean_mm": 1.0, "max_mm": 2.0}
     metrics = {
-        "tracking": {"4.0": {"open_sysid": errors, "receding_resphys": {**errors, "mean_mm": 0.5}}, "2.0": {}},
-        "reduced": {"sysid": dict.fromkeys(("modes", "window_s", "window_error_mm", "whole_error_mm"), 1)},
+        "tracking": {
+            "4.0": {"open_sysid": errors, "receding_resphys": {**errors, "mean_mm": 0.5}},
+            "2.0": {},
+        },
+        "reduced": {
+            "sysid": dict.fromkeys(("modes", "window_s", "window_error_mm", "whole_error_mm"), 1)
+        },
         "planned_mm": {"sysid": {"eight": [3.0, 0.5, 1.0], "circle": [5.0, 1.5]}},
         "command_ms": {"receding_resphys": {"median": 2.0, "largest_of_20": 4.0}, "open_sysid": {}},
     }
     metrics["reduced"]["sysid"]["window_relative"] = 0.01
     control = SimpleNamespace(seconds=(4.0,), shapes=("eight",), tracked=("A", "B"), size=0.04)
-    data = SimpleNamespace(metrics={"control": metrics}, settings=SimpleNamespace(control=control), followed=())
+    data = SimpleNamespace(
+        metrics={"control": metrics}, settings=SimpleNamespace(control=control), followed=()
+    )
     task, table, _, facts = control_section(data, None).blocks
     assert "the mean of A and B, follows 1 paths (eight) of 40 mm" in task.text
     plan, receding = table.rows
     assert plan.head == "SysID, open loop"
     assert plan.cells == [Cell("1.00", beside="at most 2.00"), Cell(NONE)]
     assert (receding.mark, plan.mark) == ("best", "")
-    assert any("to 1.00 mm after corrections" in said and "to 4.00 mm before" in said for said in facts.items)
+    assert any(
+        "to 1.00 mm after corrections" in said and "to 4.00 mm before" in said
+        for said in facts.items
+    )
     assert any("a command takes 2.0 ms" in said for said in facts.items)
-    assert control_section(SimpleNamespace(metrics={}, settings=SimpleNamespace(control=None)), None) is None
+    assert (
+        control_section(SimpleNamespace(metrics={}, settings=SimpleNamespace(control=None)), None)
+        is None
+    )
 
 
 class TestIdentification:
@@ -109,14 +140,19 @@ class TestIdentification:
         return Identification(parameters, at_bounds=("stiffness_damping",), uncertainty=uncertainty)
 
     def test_a_row_a_parameter(self, identified):
-        modulus, damping = parameter_rows(identified, {"youngs_modulus": 264e3}, {"youngs_modulus": 250e3})
+        modulus, damping = parameter_rows(
+            identified, {"youngs_modulus": 264e3}, {"youngs_modulus": 250e3}
+        )
         assert modulus.head == "Young's modulus [kPa]"
         assert modulus.cells == [Cell("264"), Cell("251.3", beside="± 2.5"), Cell("250"), Cell("")]
         assert damping.head == "Stiffness damping [ms]"
         assert damping.cells == [Cell(NONE), Cell("2.90", beside="± 0.10"), Cell(NONE), Cell("yes")]
         identified = replace(identified, parameters={"youngs_modulus": -3.0})
         assert parameter_rows(identified, {}, {})[0].cells[1].text == "0.0"
-        assert parameter_rows(replace(identified, uncertainty=None), {}, {})[0].cells[1].text == f"{MINUS}0.003"
+        assert (
+            parameter_rows(replace(identified, uncertainty=None), {}, {})[0].cells[1].text
+            == f"{MINUS}0.003"
+        )
 
     @pytest.mark.parametrize(
         ("parameter", "value", "head", "text"),
@@ -143,22 +179,36 @@ class TestIdentification:
         said = uncertainty_text("sysid", identified, None).replace(NO_BREAK_SPACE, " ")
         assert said == "SysID: stiffness damping is least certain (3.4 % of the range)."
         assert uncertainty_text("sysid", replace(identified, uncertainty=None), None) == ""
-        tied = replace(identified.uncertainty, poorest_deviation=1.9, correlation=[[1.0, -0.95], [-0.95, 1.0]])
+        tied = replace(
+            identified.uncertainty, poorest_deviation=1.9, correlation=[[1.0, -0.95], [-0.95, 1.0]]
+        )
         said = uncertainty_text("sysid", replace(identified, uncertainty=tied), None)
         assert "the data do not constrain stiffness damping: set a prior." in said
-        assert f"do not separate Young's modulus and stiffness damping (correlation {MINUS}0.95)" in said
+        assert (
+            f"do not separate Young's modulus and stiffness damping (correlation {MINUS}0.95)"
+            in said
+        )
 
     @pytest.mark.parametrize(("deviation", "informs"), [(2.5e3, True), (9.9e3, False)])
-    def test_what_the_data_add_nothing_to_is_said_to_be_its_prior(self, identified, deviation, informs):
+    def test_what_the_data_add_nothing_to_is_said_to_be_its_prior(
+        self, identified, deviation, informs
+    ):
         identified.uncertainty.deviation["youngs_modulus"] = deviation
         prior = {"mean": 250e3, "deviation": 10e3}
         ranges = {"youngs_modulus": {"lower": 5e4, "upper": 2e6, "prior": prior}}
-        said = uncertainty_text("sysid", identified, parse(IdentifySettings, {"parameters": ranges}))
-        assert said.endswith("do not constrain Young's modulus beyond its prior (250 ± 10 kPa).") is not informs
+        said = uncertainty_text(
+            "sysid", identified, parse(IdentifySettings, {"parameters": ranges})
+        )
+        assert (
+            said.endswith("do not constrain Young's modulus beyond its prior (250 ± 10 kPa).")
+            is not informs
+        )
 
     def test_where_markers_and_recordings_lie(self):
         offsets = {"A": [0.001, 0.0, 0.0], "B": [0.0, 0.003, 0.004]}
-        said = placement_text("sysid", {"offsets": offsets, "shift": [0.0, 0.002, 0.0], "turn": [0.0, 0.0, 0.1]}, {})
+        said = placement_text(
+            "sysid", {"offsets": offsets, "shift": [0.0, 0.002, 0.0], "turn": [0.0, 0.0, 0.1]}, {}
+        )
         said = said.replace(NO_BREAK_SPACE, " ")
         assert "B the most, by 5.0 mm" in said
         assert "by 2.0 mm and rotated by 5.7°" in said
@@ -167,7 +217,9 @@ class TestIdentification:
 def test_rows_of_markers_that_were_never_seen():
     table = quality_table([MarkerQuality("A", False, 0.0, 1, 9, 9, (), None, None)])
     assert table == {"A": ["0.0 %", "1", "9", "9", "0", "", ""]}
-    table = sections.residual_table({"t": {"rms_mm": 0.5, "residual_mm": {"A": None, "B": 0.5}, "outliers": []}})
+    table = sections.residual_table(
+        {"t": {"rms_mm": 0.5, "residual_mm": {"A": None, "B": 0.5}, "outliers": []}}
+    )
     assert table.columns == ["A", "B", "Root mean square"]
     assert table.rows[0].cells == [Cell(NONE), Cell("0.50"), Cell("0.50")]
     many = {str(marker): 0.1 for marker in range(9)}
@@ -187,18 +239,24 @@ def test_bodies_at_frames_instants_that_lie_apart_the_uncorrected_model_and_the_
     between = at_times(positions, times, np.array([0.0, 0.05, 0.11, 0.3, 0.5]))
     np.testing.assert_allclose(between[:, 0, 0], [0.0, 0.5, 1.1, 3.0, 3.0])
     positions[2:] = np.nan
-    np.testing.assert_array_equal(at_times(positions, times, np.array([0.1, 0.11]))[:, 0, 0], [1.0, np.nan])
+    np.testing.assert_array_equal(
+        at_times(positions, times, np.array([0.1, 0.11]))[:, 0, 0], [1.0, np.nan]
+    )
     measured, rest = np.zeros((100, 1, 3)), np.zeros((1, 3))
     measured[40, 0, 2] = -1.0
     simulated = measured.copy()
     simulated[97, 0, 0] = 1.0
-    assert instants(measured, rest, simulated) == [25, 40, 97]  # The last is too close to where the model is worst.
+    # The last is too close to where the model is worst.
+    assert instants(measured, rest, simulated) == [25, 40, 97]
     simulated[70, 0, 0] = 2.0
     assert instants(measured, rest, simulated) == [40, 70, 99]
     measured[70] = np.nan
     assert instants(measured, rest, simulated) == [25, 40, 97]
     assert instants(measured[:1], rest, simulated[:1]) == [0]
-    assert wording.shown_models({"resphys": 0, "simulation": 0, "sysid": 0}) == ["simulation", "resphys"]
+    assert wording.shown_models({"resphys": 0, "simulation": 0, "sysid": 0}) == [
+        "simulation",
+        "resphys",
+    ]
     assert wording.shown_models({"sysid": 0, "published": 0}) == ["published", "sysid"]
     every = dict.fromkeys(("simulation", "sysid", "actuator", "resphys"), 0)
     assert wording.shown_models(every, "actuator") == ["simulation", "actuator"]
@@ -213,7 +271,8 @@ def test_numbers_have_sensible_digits_and_shares_those_for_what_is_left():
     deviating = {"mean": 0.000721, "std": 0.00031, "trajectories": 5, "diverged": 0}
     assert wording.error_parts(deviating) == ("below 0.001", "")
     assert wording.error_parts({**deviating, "mean": 0.0721}) == ("0.0721", "± 0.0003")
-    assert wording.error_parts({**deviating, "mean": 0.0721, "std": None}) == ("0.0721", "")  # of one fold
+    # Of one fold.
+    assert wording.error_parts({**deviating, "mean": 0.0721, "std": None}) == ("0.0721", "")
     shown = [wording.duration_text(seconds) for seconds in (0.421, 12.34, 59.97, 184.6)]
     assert shown == ["0.42 s", "12.3 s", "60.0 s", "3 min 05 s"]
     shown = [wording.share_text(share) for share in (0.5, 0.897, 0.9958, 0.99976, 1.0, -0.2)]
@@ -222,7 +281,8 @@ def test_numbers_have_sensible_digits_and_shares_those_for_what_is_left():
 
 def test_each_trial_has_its_errors_its_amplitude_and_its_coverage():
     rows = [
-        {"name": name, "errors_mm": {"sysid": error}, "amplitude_mm": 20.0} for name, error in [("a", 1.0), ("b", 2.0)]
+        {"name": name, "errors_mm": {"sysid": error}, "amplitude_mm": 20.0}
+        for name, error in [("a", 1.0), ("b", 2.0)]
     ]
     covered = {"models": {"sysid": {"by_trial": {"a": 0.93}}}}
     metrics = {"per_trajectory": rows, "errors_mm": {"sysid": {"mean": 1.5}}, "intervals": covered}
@@ -233,15 +293,26 @@ def test_each_trial_has_its_errors_its_amplitude_and_its_coverage():
         ("a", "1.00", "amplitude 20 mm, coverage 93 %"),
         ("b", "2.00", "amplitude 20 mm, other loads"),
     ]
-    assert sections.trials_section(SimpleNamespace(metrics={}, others=(), pages={}, driven=None), None) is None
+    assert (
+        sections.trials_section(SimpleNamespace(metrics={}, others=(), pages={}, driven=None), None)
+        is None
+    )
 
 
 def test_what_could_explain_the_remaining_error_is_that_of_the_best_model():
     def fit(name, error, **left):
-        return {"name": name, "as_is_mm": error, "left_mm": left, "values": {"scale": 0.05, "zero": 2.0}}
+        return {
+            "name": name,
+            "as_is_mm": error,
+            "left_mm": left,
+            "values": {"scale": 0.05, "zero": 2.0},
+        }
 
     quantity = SimpleNamespace(shown=lambda value: f"{value:g} kPa")
-    fits = {"sysid": [fit("a", 2.0, scale=1.0, zero=0.5), fit("b", 4.0, scale=1.0)], "simulation": [fit("a", 9.0)]}
+    fits = {
+        "sysid": [fit("a", 2.0, scale=1.0, zero=0.5), fit("b", 4.0, scale=1.0)],
+        "simulation": [fit("a", 9.0)],
+    }
     driven = Driven(quantity, ("c",), {})
     (table,) = sections.rest_table(fits, driven)
     assert table.columns == ["As it is", "Refitted gain", "Refitted offset"]
@@ -250,10 +321,15 @@ def test_what_could_explain_the_remaining_error_is_that_of_the_best_model():
         [("4.00", ""), ("1.00", "+5.0 %"), (NONE, "")],
         [("3.00", ""), ("1.00", ""), ("2.25", "")],
     ]
-    assert sections.rest_table({}, None) == sections.rest_table({"sysid": [fit("a", 2.0)]}, None) == []
+    assert (
+        sections.rest_table({}, None) == sections.rest_table({"sysid": [fit("a", 2.0)]}, None) == []
+    )
 
     def text(gains, left=1.0, pressures=(3.0, 1.0, 2.0)):
-        rows = [fit(n, 2.0, scale=left) | {"values": {"scale": gain}} for n, gain in zip("abc", gains, strict=True)]
+        rows = [
+            fit(n, 2.0, scale=left) | {"values": {"scale": gain}}
+            for n, gain in zip("abc", gains, strict=True)
+        ]
         values = {n: np.array([[0.0], [-p]]) for n, p in zip("abc", pressures, strict=True)}
         return sections.gain_text(rows, Driven(quantity, ("c",), values))
 
@@ -273,7 +349,10 @@ def result(simulation, sysid=None, law=None, **more):
 def test_trials_out_of_range_and_models_that_diverge_on_a_body_are_counted_where_they_belong():
     lost = result(1.0, 0.2)
     lost["errors_mm"]["law"] = None
-    rows = {row.head: [cell.text for cell in row.cells] for row in sections.shapes_table({"rod": lost}).rows}
+    rows = {
+        row.head: [cell.text for cell in row.cells]
+        for row in sections.shapes_table({"rod": lost}).rows
+    }
     assert rows == {"rod": ["1.00", "0.200", "diverged"]}
     none, some, late = {"first_s": {}}, {"first_s": {"b": 2.5, "a": 1.0}}, {"first_s": {"d": 0.25}}
     metrics = {
@@ -286,23 +365,42 @@ def test_trials_out_of_range_and_models_that_diverge_on_a_body_are_counted_where
     }
     table = range_table({**metrics, "errors_mm": {}}, ["a", "b", "c"])
     assert table.columns == ["Of the test trials", f"Inputs {TIMES} 1.25", f"Inputs {TIMES} 1.5"]
-    rows = {row.head: [(c.text, c.small.replace(NO_BREAK_SPACE, " ")) for c in row.cells] for row in table.rows}
+    rows = {
+        row.head: [(c.text, c.small.replace(NO_BREAK_SPACE, " ")) for c in row.cells]
+        for row in table.rows
+    }
     assert rows == {
         "SimFree": [("none of 3", "")] * 3,
-        "ResPhys": [("2 of 3", "after 1.00 s (a)"), ("none of 3", ""), ("1 of 3", "after 0.25 s (d)")],
+        "ResPhys": [
+            ("2 of 3", "after 1.00 s (a)"),
+            ("none of 3", ""),
+            ("1 of 3", "after 0.25 s (d)"),
+        ],
     }
     at_once = {"range": {"simfree": {"first_s": dict.fromkeys("abcd", 0.0)}}, "errors_mm": {}}
-    assert range_table(at_once, "abcd").rows[0].cells == [Cell("4 of 4", "from the start (a, b and 2 more)")]
+    assert range_table(at_once, "abcd").rows[0].cells == [
+        Cell("4 of 4", "from the start (a, b and 2 more)")
+    ]
     assert range_table({}, ["a"]) is None
 
 
 @pytest.mark.usefixtures("no_drawing")
 def test_page_has_the_bodies(tmp_path):
     write_vertex_run(tmp_path, vertex_settings(), models=("simulation", "simfree", "resphys"))
-    found = {"thin <beam>": result(1.5, 0.3, 0.015, outside=0.12), "L": result(2.0, 0.5, 0.002, outside=0.0)}
+    found = {
+        "thin <beam>": result(1.5, 0.3, 0.015, outside=0.12),
+        "L": result(2.0, 0.5, 0.002, outside=0.0),
+    }
     write_json(tmp_path / "shapes.json", found)
     shape = {"mesh": vertex_settings().mesh, "fixed": {"x": 0.0}, "held": {"twist_deg": 10.0}}
     ranges = {"youngs_modulus": {"lower": 1e5, "upper": 1e6}}
-    page = report(tmp_path, vertex_settings().changed(identify={"parameters": ranges}, shapes={"thin": shape}))
-    page.says("Other bodies of the same material", "thin <beam>", "removes 99 %", "225 vertices, moves by 12.5 mm")
+    page = report(
+        tmp_path, vertex_settings().changed(identify={"parameters": ranges}, shapes={"thin": shape})
+    )
+    page.says(
+        "Other bodies of the same material",
+        "thin <beam>",
+        "removes 99 %",
+        "225 vertices, moves by 12.5 mm",
+    )
     assert "was learned at, with the share of cells and times: thin <beam> (12 %)." in page.text

@@ -42,20 +42,26 @@ def swinging(frames=40, models=("simulation", "resphys")):
     target = mesh.vertices + 0.01 * np.sin(7.0 * times)[:, None, None] * shape
     markers = {model: q[:, some] for model, q in positions.items()}
     gravity = np.array([0.0, 0.0, -9.81])
-    return ComparedMotion(mesh, times, target[:, some], positions, markers, mesh.vertices[some], gravity), target
+    return ComparedMotion(
+        mesh, times, target[:, some], positions, markers, mesh.vertices[some], gravity
+    ), target
 
 
 def corners(data):
     """(T, P, 3) corners of the obstacles, as the script of the page computes them."""
     owners, local = decoded(data["owners"], "<u4"), decoded(data["obstacles"], "<f4").reshape(-1, 3)
     poses = decoded(data["poses"], "<f4").reshape(-1, owners[-1] + 1, 12)[:, owners]
-    return poses[..., :3] + (poses[..., 3:].reshape(*poses.shape[:2], 3, 3) @ local[..., None])[..., 0]
+    return (
+        poses[..., :3] + (poses[..., 3:].reshape(*poses.shape[:2], 3, 3) @ local[..., None])[..., 0]
+    )
 
 
 def test_the_scenes_of_a_motion_have_its_obstacles_where_they_are_in_each_frame():
     motion, _ = swinging()
     obstacles = {"floor": Sphere(position=(0.0, 0.0, -0.2), radius=0.05)}
-    obstacles["bar"] = Capsule(position=(0.05, 0.01, -0.1), axis=(1.0, 0.0, 0.0), radius=0.01, length=0.05, moves=True)
+    obstacles["bar"] = Capsule(
+        position=(0.05, 0.01, -0.1), axis=(1.0, 0.0, 0.0), radius=0.01, length=0.05, moves=True
+    )
     inputs = {
         "obstacle_move_z": np.outer(0.1 * motion.times, [0.0, 1.0]),
         "obstacle_rotate_z": np.outer(motion.times, [0, 1]),
@@ -66,9 +72,15 @@ def test_the_scenes_of_a_motion_have_its_obstacles_where_they_are_in_each_frame(
     assert np.ptp(surface.points[:, bar, 2].mean(axis=1)) > 0.03
     for scene, frames in ((motion.scene(), motion.instants), (motion.film(), slice(None))):
         for view in scene.views:
-            (drawn,) = (layer for layer in view.layers if layer.kind == "surface" and layer.colour == OBSTACLE)
+            (drawn,) = (
+                layer
+                for layer in view.layers
+                if layer.kind == "surface" and layer.colour == OBSTACLE
+            )
             assert np.isin(drawn.points, surface.points[frames]).all()
-            assert len(drawn.points) == len(next(layer for layer in view.layers if layer.points.ndim == 3).points)
+            assert len(drawn.points) == len(
+                next(layer for layer in view.layers if layer.points.ndim == 3).points
+            )
     data = json.loads(str(view_in_space("view", motion, ["resphys"], "caption", "alt").payload))
     np.testing.assert_allclose(corners(data), surface.points, atol=1e-7)
     np.testing.assert_array_equal(decoded(data["sides"], "<u4").reshape(-1, 3), surface.triangles)
@@ -82,12 +94,17 @@ def test_what_the_script_reads_are_the_bodies(every_vertex):
     block = view_in_space("view", motion, ["resphys"], "caption", "alt")
     data = json.loads(str(block.payload))
     surface = np.unique(boundary_triangles(motion.mesh))
-    basis = decoded(data["modes"], "<i2").reshape(len(data["scales"]), -1) * np.array(data["scales"])[:, None]
+    basis = (
+        decoded(data["modes"], "<i2").reshape(len(data["scales"]), -1)
+        * np.array(data["scales"])[:, None]
+    )
     weights = decoded(data["weights"], "<f4").reshape(2, 40, -1)
     rest = decoded(data["rest"], "<f4").reshape(-1, 3)
     places = rest + (weights @ basis).reshape(2, 40, -1, 3)
     faces = decoded(data["faces"], "<u4").reshape(-1, 3)
-    np.testing.assert_allclose(rest[faces], motion.mesh.vertices[boundary_triangles(motion.mesh)], atol=1e-8)
+    np.testing.assert_allclose(
+        rest[faces], motion.mesh.vertices[boundary_triangles(motion.mesh)], atol=1e-8
+    )
     for place, q in zip(places, motion.positions.values(), strict=True):
         np.testing.assert_allclose(place, q[:, surface], atol=2.5e-4 * 0.1)
     expected = target if every_vertex else motion.measured
@@ -100,8 +117,12 @@ def test_what_the_script_reads_are_the_bodies(every_vertex):
         np.testing.assert_allclose(means, away.mean(axis=1), rtol=1e-3)
     if every_vertex:
         shares = decoded(data["errors"], "u1").reshape(2, 40, -1) / 255
-        away = 1e3 * np.linalg.norm(motion.positions["resphys"][:, surface] - target[:, surface], axis=2)
-        np.testing.assert_allclose(shares[1] * data["models"][1]["largest"], away, atol=away.max() / 400)
+        away = 1e3 * np.linalg.norm(
+            motion.positions["resphys"][:, surface] - target[:, surface], axis=2
+        )
+        np.testing.assert_allclose(
+            shares[1] * data["models"][1]["largest"], away, atol=away.max() / 400
+        )
     assert [model["shown"] for model in data["models"]] == [False, True]
 
 
@@ -113,7 +134,8 @@ def test_a_basis_is_as_small_as_it_may_be():
     basis, weights = reduced(displacements, 1e-9, 20)
     assert basis.shape == (3, 30)
     np.testing.assert_allclose((weights @ basis).reshape(2, 20, 10, 3), displacements, atol=1e-9)
-    basis, weights = reduced(displacements, 1e9, 20)  # Whatever moves so little still says where it is known.
+    # Whatever moves so little still says where it is known.
+    basis, weights = reduced(displacements, 1e9, 20)
     np.testing.assert_array_equal(basis, np.zeros((1, 30)))
     assert np.isfinite(weights[0]).all()
     assert np.isnan(weights[1, 7:]).all()
@@ -143,7 +165,12 @@ def opened(browser, page, width, dark):
     """The view on the page, at a width, after its first picture."""
     from selenium.webdriver.common.by import By
 
-    metrics = {"width": width, "height": 900, "deviceScaleFactor": 2 if width < 600 else 1, "mobile": width < 600}
+    metrics = {
+        "width": width,
+        "height": 900,
+        "deviceScaleFactor": 2 if width < 600 else 1,
+        "mobile": width < 600,
+    }
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
     scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
@@ -207,9 +234,13 @@ def test_the_view_is_turned_played_and_compared(browser, page, width, dark):
     button.click()
     assert button.get_attribute("aria-label") == "Play"
     slider = view.find_element(By.CLASS_NAME, "time")
-    browser.execute_script("arguments[0].value = 500; arguments[0].dispatchEvent(new Event('input'))", slider)
+    browser.execute_script(
+        "arguments[0].value = 500; arguments[0].dispatchEvent(new Event('input'))", slider
+    )
     drawn(browser, view)
-    at, end = (float(number) for number in re.findall(r"\d+\.\d+", slider.get_attribute("aria-valuetext")))
+    at, end = (
+        float(number) for number in re.findall(r"\d+\.\d+", slider.get_attribute("aria-valuetext"))
+    )
     assert at == pytest.approx(end / 2, abs=0.011)
     assert clock.text == f"{at:.2f} s"
 
@@ -250,13 +281,17 @@ def test_a_browser_without_webgl_says_so(browser, page):
 def test_the_script_places_obstacles_between_frames(browser, page):
     """The floor stays where it is; the bar is halfway between two frames."""
     floor, bar = Sphere(position=(0.0, 0.0, -0.2), radius=0.05), Sphere(radius=0.01, moves=True)
-    body = Body(box_hexahedra((0.1, 0.02, 0.02), (2, 1, 1)), energies=[Contact({"floor": floor, "bar": bar})])
+    body = Body(
+        box_hexahedra((0.1, 0.02, 0.02), (2, 1, 1)),
+        energies=[Contact({"floor": floor, "bar": bar})],
+    )
     surface = ObstacleSurface.of(body, {"obstacle_x": 0.2})
     moved = surface.moved({"obstacle_move_z": np.outer([0.0, 0.1, 0.4], [0.0, 1.0])})
     view = opened(browser, page, 1100, False)
-    script = """const [figure, obstacles, owners, poses] = arguments, around = new Float32Array(obstacles.length);
+    script = """const [figure, obstacles, owners, poses] = arguments;
+        const around = new Float32Array(obstacles.length), data = {times: [0, 1, 2]};
         const own = Object.create(Object.getPrototypeOf(figure.view));
-        return [...Object.assign(own, {obstacles, owners, poses, around, data: {times: [0, 1, 2]}}).placed(1.5)];"""
+        return [...Object.assign(own, {obstacles, owners, poses, around, data}).placed(1.5)];"""
     for own, expected in ((surface, surface.points), (moved, moved.points[1:].mean(axis=0))):
         arrays = [values.ravel().tolist() for values in (own.local, own.owners, own.poses)]
         placed = np.reshape(browser.execute_script(script, view, *arrays), (-1, 3))

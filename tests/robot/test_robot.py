@@ -1,4 +1,6 @@
-"""A finished run as a robot: it does what the evaluation did, by names, with gradients, and from one file."""
+"""A finished run as a robot: it does what the evaluation did,
+by names, with gradients, and from one file.
+"""
 
 import copy
 import json
@@ -80,7 +82,9 @@ class TestRollouts:
             assert torch.equal(state.reaction.forces, motion.reaction.forces[-1])
             constants = robot.constants
             weight = (constants.load_mass[..., None] * constants.gravity[:, None]).sum(1)
-            torch.testing.assert_close(start.reaction.force, -weight.expand(2, -1), rtol=0.0, atol=1e-6)
+            torch.testing.assert_close(
+                start.reaction.force, -weight.expand(2, -1), rtol=0.0, atol=1e-6
+            )
             one = robot.rollout(start.select([1]), pressure=pressure[:, 1:])
             further = robot.rollout(motion.final, 2, pressure=[HIGH, 0.0])
         torch.testing.assert_close(one.q[:, 0], motion.q[:, 1], atol=1e-9, rtol=0.0)
@@ -100,7 +104,9 @@ class TestRollouts:
             assert torch.equal(threads[number], expected)
             assert torch.equal(played(copies[number], 3 + number).q, expected)
         motion = copy.deepcopy(played(robot, 3))
-        assert torch.equal(robot.step(motion.final).q, copies[0].step(pickle.loads(pickle.dumps(motion.final))).q)
+        assert torch.equal(
+            robot.step(motion.final).q, copies[0].step(pickle.loads(pickle.dumps(motion.final))).q
+        )
 
     def test_its_markers_are_plotted(self, robot):
         motion = played(robot, 3)
@@ -117,7 +123,8 @@ class TestRollouts:
             motion = robot.rollout(rest, 3, pressure=[HIGH, 0.0])
             begun = robot.begin(pressure={"chamber_1": HIGH})
         assert float((motion.q - rest.q).abs().max()) < 2e-6
-        assert float((begun.q - rest.q).abs().max()) > 1e-5  # without the learned force it rests elsewhere
+        # Without the learned force it rests elsewhere.
+        assert float((begun.q - rest.q).abs().max()) > 1e-5
 
     def test_leaving_the_training_range_is_reported(self, robot):
         q = robot.begin(2).q.clone()
@@ -136,26 +143,40 @@ class TestGradients:
                 youngs_modulus=factor * robot.parameters["youngs_modulus"], pressure_factor=factor
             )
             start = own.begin()
-            start = own.state(start.q + lift * torch.tensor([0.0, 0.0, 1.0]) * (start.q[..., 2:] < -0.05), start.v)
+            start = own.state(
+                start.q + lift * torch.tensor([0.0, 0.0, 1.0]) * (start.q[..., 2:] < -0.05), start.v
+            )
             return own.rollout(start, pressure=pressure).markers[-1, 0, 0, 0]
 
-        values = [wave(3)[:, 0] + 100.0, torch.ones(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)]
+        values = [
+            wave(3)[:, 0] + 100.0,
+            torch.ones(1, dtype=torch.float64),
+            torch.zeros(1, dtype=torch.float64),
+        ]
         values = [value.requires_grad_(True) for value in values]
         tip(*values).backward()
         with torch.no_grad():
-            for at, step in ((0, 30.0), (1, 1e-2), (2, 3e-5)):  # Less of a step, and float32 forces round it away.
+            # Less of a step, and float32 forces round it away.
+            for at, step in ((0, 30.0), (1, 1e-2), (2, 3e-5)):
                 change = torch.zeros_like(values[at])
                 change.view(-1)[0] = step
-                ends = [tip(*(x + s * change if i == at else x for i, x in enumerate(values))) for s in (1.0, -1.0)]
+                ends = [
+                    tip(*(x + s * change if i == at else x for i, x in enumerate(values)))
+                    for s in (1.0, -1.0)
+                ]
                 difference = float(ends[0] - ends[1]) / (2.0 * step)
                 assert float(values[at].grad.view(-1)[0]) == pytest.approx(difference, rel=1e-4)
 
     def test_each_environment_has_its_own_parameters(self, robot):
-        moduli = robot.parameters["youngs_modulus"] * torch.tensor([0.7, 1.0, 1.4], dtype=torch.float64)
+        moduli = robot.parameters["youngs_modulus"] * torch.tensor(
+            [0.7, 1.0, 1.4], dtype=torch.float64
+        )
         rises = torch.tensor([0.001, 0.02, 0.1], dtype=torch.float64)
         delays = torch.tensor([0.0, 0.013, 0.03], dtype=torch.float64)
         with torch.no_grad():
-            own = robot.with_parameters(youngs_modulus=moduli, pressure_rise=rises, pressure_delay=delays)
+            own = robot.with_parameters(
+                youngs_modulus=moduli, pressure_rise=rises, pressure_delay=delays
+            )
             together = own.rollout(own.begin(3), pressure=wave(4))
             for row in range(3):
                 one = robot.with_parameters(
@@ -190,7 +211,9 @@ class TestFiles:
         assert body.n_cells == len(robot.simulator.body.mesh.cells)
         np.testing.assert_allclose(body.points, motion.q[-1, 0].numpy(), atol=1e-9)
         rest = robot.simulator.body.mesh.vertices
-        np.testing.assert_allclose(body.point_data["displacement"], motion.q[-1, 0].numpy() - rest, atol=1e-9)
+        np.testing.assert_allclose(
+            body.point_data["displacement"], motion.q[-1, 0].numpy() - rest, atol=1e-9
+        )
         dots = pyvista.get_reader(tmp_path / "arm_markers.pvd")
         dots.set_active_time_value(motion.times[-1])
         np.testing.assert_allclose(dots.read()[0].points, motion.markers[-1, 0].numpy(), atol=1e-9)
@@ -203,14 +226,20 @@ class TestFiles:
         for name in ("arm.usda", "arm.usd"):
             stage = Usd.Stage.Open(str(motion.write_usd(tmp_path / name)))
             assert UsdGeom.GetStageUpAxis(stage) == "Z"
-            assert stage.GetEndTimeCode() / stage.GetTimeCodesPerSecond() == pytest.approx(motion.times[-1])
+            assert stage.GetEndTimeCode() / stage.GetTimeCodesPerSecond() == pytest.approx(
+                motion.times[-1]
+            )
             body = UsdGeom.Mesh(stage.GetPrimAtPath("/robot/body"))
             at = np.array(body.GetPointsAttr().Get(3.0))
-            kept = np.unique(warp_resphys.mesh.volume_mesh.boundary_triangles(robot.simulator.body.mesh))
+            kept = np.unique(
+                warp_resphys.mesh.volume_mesh.boundary_triangles(robot.simulator.body.mesh)
+            )
             np.testing.assert_allclose(at, motion.q[3, 0].numpy()[kept], atol=1e-6)
             faces = np.array(body.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
             corners = at[faces]
-            volume = np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+            volume = (
+                np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+            )
             assert volume > 1e-5  # m^3: faces look outwards
 
 
@@ -223,9 +252,11 @@ class TestBadInput:
 
             (lambda r, s: r.step(s, pressure={"3": 1.0}), "'3': it has 'chamber_1', 'chamber_2'"),
             (lambda r, s: r.step(s, pressure=[1.0, 2.0, 3.0]), r"pressure has shape \(1, 3\)"),
-            (lambda r, s: r.step(s, pressure=[float("nan"), 0.0]), "pressure has values that are not finite"),
+            (lambda r, s: r.step(s, pressure=[float("nan"), 0.0]), "pressure has values that are "
+                                                                   "not finite"),
 
-            (lambda r, s: r.step(s, base=[0.5, 0.0, 0.0, 0.0, 0.0, 0.0]), "base moves by 500 mm in a step of"),
+            (lambda r, s: r.step(s, base=[0.5, 0.0, 0.0, 0.0, 0.0, 0.0]), "base moves by 500 mm "
+                                                                          "in a step of"),
             (lambda r, s: r.rollout(s, pressure=[0.0, 0.0]), "steps"),
             (lambda r, s: r.with_parameters(youngs=1.0), "'youngs'.*youngs_modulus"),
             (lambda r, s: r.save("robot.pt"), ".safetensors"),
@@ -237,7 +268,13 @@ class TestBadInput:
         refuses(InputError, sentence, call, robot, robot.begin())
 
     def test_models_and_files(self, arm, robot, tmp_path):
-        refuses(InputError, r"'resfys': .* has 'simulation', .*'sysid'", warp_resphys.load, arm, "resfys")
+        refuses(
+            InputError,
+            r"'resfys': .* has 'simulation', .*'sysid'",
+            warp_resphys.load,
+            arm,
+            "resfys",
+        )
         kept = robot.save(tmp_path / "robot.safetensors")
         refuses(InputError, r"'sysid', but .* 'resphys'", warp_resphys.load, kept, "sysid")
         refuses(InputError, "no trials", warp_resphys.trial_names, warp_resphys.load(kept))
@@ -248,7 +285,10 @@ class TestBadInput:
         refuses(DataFileError, "does not exist", warp_resphys.load, tmp_path / "nothing")
         refuses(DataFileError, "not a run folder", warp_resphys.load, tmp_path)
         (tmp_path / "pulls.csv").write_text("time [s]\n")
-        with pytest.raises(DataFileError, match=r"pulls\.csv is no robot: name a run folder, or a \.safetensors file"):
+        with pytest.raises(
+            DataFileError,
+            match=r"pulls\.csv is no robot: name a run folder, or a \.safetensors file",
+        ):
             warp_resphys.load(tmp_path / "pulls.csv")
 
     @pytest.mark.parametrize(
@@ -270,7 +310,12 @@ class TestBadInput:
 
     def test_a_simulator_can_be_loaded_before_the_run_is_evaluated(self, arm, tmp_path):
         folder = Path(shutil.copytree(arm, tmp_path / "run"))
-        for name in ("stages/evaluate.json", "errors.json", "rollouts.h5", "stages/train_resphys.json"):
+        for name in (
+            "stages/evaluate.json",
+            "errors.json",
+            "rollouts.h5",
+            "stages/train_resphys.json",
+        ):
             (folder / name).unlink()
         early, late = warp_resphys.load(folder, "sysid"), warp_resphys.load(arm, "sysid")
         assert early.description.parameters == late.description.parameters
@@ -288,7 +333,13 @@ def test_its_description(robot, arm):
     text = repr(robot)
     advised = read_json(arm / "metrics.json")["recommended"]
     assert f"run, {advised} (recommended): " in repr(warp_resphys.load(arm))
-    for part in ("run, resphys (", "3 markers", "pressure [Pa]: chamber_1, chamber_2", "pressure_delay: ", "error"):
+    for part in (
+        "run, resphys (",
+        "3 markers",
+        "pressure [Pa]: chamber_1, chamber_2",
+        "pressure_delay: ",
+        "error",
+    ):
         assert part in text
     low, high = robot.inputs["pressure"].low, robot.inputs["pressure"].high
     assert low[0] >= 0.0
@@ -299,7 +350,9 @@ def test_its_description(robot, arm):
 
 @pytest.mark.slow
 def test_the_lines_of_the_readme(tmp_path, monkeypatch):
-    """A beam of two silicones, which README.md simulates as one: the corrected robot is right under another pull."""
+    """A beam of two silicones, which README.md simulates as one:
+    the corrected robot is right under another pull.
+    """
     text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
     (lines,) = re.findall(r"<!-- robot -->\n```python\n(.*?)```", text, flags=re.DOTALL)
     monkeypatch.chdir(tmp_path)
@@ -316,20 +369,28 @@ def test_the_lines_of_the_readme(tmp_path, monkeypatch):
     )
     uncorrected, identified, corrected = (
         warp_resphys.evaluate(simulator, motion, force, parameters=material).mean()
-        for force, material in ((None, None), (None, names["material"]), (names["force"], names["material"]))
+        for force, material in (
+            (None, None),
+            (None, names["material"]),
+            (names["force"], names["material"]),
+        )
     )
     assert corrected < 0.4 * identified < 0.4 * uncorrected
     assert corrected < 2e-4  # m
 
 
 def record_pulls(path, tension):
-    """Writes markers of a beam of a stiff and a soft silicone that a tendon pulls, with noise of 0.02 mm."""
+    """Writes markers of a beam of a stiff and a soft silicone
+    that a tendon pulls, with noise of 0.02 mm.
+    """
     box = warp_resphys.box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(8, 2, 2))
     root = box.vertices[box.cells].mean(axis=1)[:, 0] < 0.05
     halves = {"root": np.flatnonzero(root), "tip": np.flatnonzero(~root)}
     mesh = warp_resphys.quadratic(warp_resphys.Mesh(box.vertices, box.cells, halves))
     tendon = warp_resphys.Tendons([[[x, 0.015, 0.003] for x in (0.0, 0.05, 0.1)]])
-    body = warp_resphys.Body(mesh, fixed=warp_resphys.select_vertices(mesh, x=0.0), energies=[tendon])
+    body = warp_resphys.Body(
+        mesh, fixed=warp_resphys.select_vertices(mesh, x=0.0), energies=[tendon]
+    )
     silicones = {
         name: warp_resphys.Corotated(modulus, 0.45, density=1070.0, stiffness_damping=0.01)
         for name, modulus in (("root", 400e3), ("tip", 150e3))
@@ -342,6 +403,8 @@ def record_pulls(path, tension):
     q = real.rollout(real.rest_state(), len(tension), inputs).q
     seen = torch.cat([markers(positions) for positions in q]).numpy()
     seen += 2e-5 * np.random.default_rng(0).standard_normal(seen.shape)
-    head = ",".join(["time [s]", *(f"{name}.{axis} [m]" for name in names for axis in "xyz"), "tendon [N]"])
+    head = ",".join(
+        ["time [s]", *(f"{name}.{axis} [m]" for name in names for axis in "xyz"), "tendon [N]"]
+    )
     columns = [0.01 * np.arange(len(seen)), seen.reshape(len(seen), -1), np.append(0.0, tension)]
     np.savetxt(path, np.column_stack(columns), "%.7f", ",", header=head, comments="")

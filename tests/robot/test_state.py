@@ -22,10 +22,14 @@ def test_environments_are_chosen_from_two_states_repeated_and_selected():
     """What a state lacks is zero there, and its past is its present."""
     more = {"base": torch.ones(2, 2, 6), "left": torch.tensor([True, True])}
     first, still = moved(2, **more), torch.zeros(2, 2, 3).double()
-    second = State(still + 5.0, still, (still + 3.0, still)).with_memory({"pressure.queue": torch.zeros(2, 2, 2)})
+    second = State(still + 5.0, still, (still + 3.0, still)).with_memory(
+        {"pressure.queue": torch.zeros(2, 2, 2)}
+    )
     mixed = first.where(torch.tensor([True, False]), second)
     for name, joined in mixed.tensors().items():
-        assert torch.equal(joined[0], {**first.tensors(), "previous_q": first.q, "previous_v": first.v}[name][0])
+        assert torch.equal(
+            joined[0], {**first.tensors(), "previous_q": first.q, "previous_v": first.v}[name][0]
+        )
         assert torch.equal(joined[1], second.tensors().get(name, torch.zeros_like(joined))[1])
     assert mixed.memory_of().keys() == {"pressure.queue", *more}
     assert mixed.left.tolist() == [True, False]
@@ -67,8 +71,13 @@ def test_markers_are_interpolated_between_steps():
 
 def test_inputs_are_given_by_part_by_environment_or_for_all():
     body = Body(box_hexahedra((0.04, 0.01, 0.01), (4, 1, 1)))
-    pressure = RobotInput("pressure", "Pa", ("left", "right"), quantity=Quantity("pressure", "Pa", 0.0, closed=True))
-    reader = InputReader({"pressure": pressure, "payload": RobotInput("payload", "kg", ("payload",))}, Simulator(body))
+    pressure = RobotInput(
+        "pressure", "Pa", ("left", "right"), quantity=Quantity("pressure", "Pa", 0.0, closed=True)
+    )
+    reader = InputReader(
+        {"pressure": pressure, "payload": RobotInput("payload", "kg", ("payload",))},
+        Simulator(body),
+    )
     assert reader.read("pressure", {"right": 2.0}, 2).tolist() == [[0.0, 2.0]] * 2
     assert reader.read("pressure", [1.0, 2.0], 2).tolist() == [[1.0, 2.0]] * 2
     assert reader.read("payload", [1.0, 2.0], 2).tolist() == [[1.0], [2.0]]

@@ -18,7 +18,10 @@ def test_a_motion_passes_with_every_solver_and_fails_beyond_its_bound(monkeypatc
     done = list(check.motion_checks(name, CPU))
     assert all(own.passed for own in done), done
     names = [own.name for own in done]
-    assert {f"{name}, quasi_newton, {linear}, float64" for linear in ("auto", "tiled", "dense", "sparse")} < {*names}
+    assert {
+        f"{name}, quasi_newton, {linear}, float64"
+        for linear in ("auto", "tiled", "dense", "sparse")
+    } < {*names}
     assert {f"{name}, height on the CPU", f"{name}, the last one alone"} < {*names}
     monkeypatch.setitem(check.POSITION_BOUND, torch.float64, 0.0)
     wrong = [own.name for own in check.motion_checks(name, CPU) if not own.passed]
@@ -39,8 +42,12 @@ def test_a_wrong_gradient_or_an_error_is_a_failed_check(monkeypatch):
 @pytest.mark.parametrize(("height", "code"), [(None, 0), (0.1, 1)])
 def test_the_exit_code_says_whether_all_checks_passed(height, code, folder, monkeypatch):
     build, own = check.MOTIONS["quadratic tetrahedra"]
-    monkeypatch.setattr(check, "MOTIONS", {"quadratic tetrahedra": (build, own if height is None else height)})
-    monkeypatch.setattr(check, "GRADIENTS", {"hexahedra at rest": check.GRADIENTS["hexahedra at rest"]})
+    monkeypatch.setattr(
+        check, "MOTIONS", {"quadratic tetrahedra": (build, own if height is None else height)}
+    )
+    monkeypatch.setattr(
+        check, "GRADIENTS", {"hexahedra at rest": check.GRADIENTS["hexahedra at rest"]}
+    )
     monkeypatch.setattr(check, "_TIMED", (1,))
     ended = outcome("check", "cpu")
     assert ended.code == code, ended.err

@@ -13,7 +13,8 @@ def test_the_motion_is_that_of_the_evaluation(finished):
     run = finished[0]
     motion = motion_of(run, "150 g", ["simulation", "resphys"])
     with h5py.File(run / "rollouts.h5") as file:
-        known = {name: file[f"{name}_observed"][1] for name in ("simulation", "resphys")}  # tests are 70 and 150 g
+        # Tests are 70 and 150 g.
+        known = {name: file[f"{name}_observed"][1] for name in ("simulation", "resphys")}
     assert list(motion.positions) == ["simulation", "resphys"]
     for name, expected in known.items():
         np.testing.assert_allclose(motion.positions[name], expected, rtol=0.0, atol=2e-8)
@@ -22,7 +23,9 @@ def test_the_motion_is_that_of_the_evaluation(finished):
     np.testing.assert_allclose(motion.bound[:, 0], 0.1)
     assert len(motion_of(run, "150 g", ["resphys"], 0.05).times) == 6
     # It was simulated, and the film does not call it measured.
-    assert [text for view in motion.film().views for text, _ in view.legend][-1] == "vertices of the simulated target"
+    assert [text for view in motion.film().views for text, _ in view.legend][
+        -1
+    ] == "vertices of the simulated target"
 
 
 @pytest.mark.slow
@@ -33,7 +36,10 @@ def test_a_command_makes_it(finished, folder, can_draw):
     told = next(frames)
     assert told["duration"] == pytest.approx(13 * 0.01 * 2.0, rel=0.1)
     first, *_, last = frames
-    assert np.abs(np.frombuffer(first, np.uint8).astype(int) - np.frombuffer(last, np.uint8)).max() > 100
+    assert (
+        np.abs(np.frombuffer(first, np.uint8).astype(int) - np.frombuffer(last, np.uint8)).max()
+        > 100
+    )
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,9 @@ def arm():
 
 def test_ideal_cells_are_worth_one_and_a_sheared_brick_the_sine_of_its_angle():
     assert scaled_jacobian(box_hexahedra((3.0, 1.0, 1.0), (1, 1, 1))) == pytest.approx(1.0)
-    regular = Mesh(np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), np.array([[0, 2, 1, 3]]))
+    regular = Mesh(
+        np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), np.array([[0, 2, 1, 3]])
+    )
     np.testing.assert_allclose(np.abs(scaled_jacobian(regular)), 1.0)
     np.testing.assert_allclose(scaled_jacobian(quadratic(regular)), scaled_jacobian(regular))
     box = box_hexahedra((1.0, 1.0, 1.0), (1, 1, 1))
@@ -66,7 +68,9 @@ class TestQuadraticCells:
         """As two simulations of silicone differ, in the direction that differs most."""
         write_mesh(tmp_path / "beam.msh", mesh)
         row = inspected(f"mesh.path={tmp_path}/beam.msh", "fixed.x=0")["quadratic cells"]
-        assert row.startswith(f"sag {abs(percent)} % {'more' if percent > 0 else 'less'} under their weight")
+        assert row.startswith(
+            f"sag {abs(percent)} % {'more' if percent > 0 else 'less'} under their weight"
+        )
         assert "held at x = 0 m" in row
         assert row.endswith("too coarse") == (abs(percent) > 7)
         sags = []
@@ -75,7 +79,10 @@ class TestQuadraticCells:
             simulator = Simulator(body, Corotated(5e7, 0.49), relative_tolerance=1e-6)
             mass = simulator.prepare().load_mass[0]
             pulls = torch.tensor([[0.0, -9.81, 0.0], [0.0, 0.0, -9.81]])
-            falls = simulator.static_equilibrium(parameters={"gravity": pulls}).q - simulator.rest_positions
+            falls = (
+                simulator.static_equilibrium(parameters={"gravity": pulls}).q
+                - simulator.rest_positions
+            )
             sags.append((mass @ falls)[[0, 1], [1, 2]])
         change = max((sags[1] / sags[0] - 1.0).tolist(), key=abs)
         assert 100.0 * change == pytest.approx(percent, abs=1.0)
@@ -83,13 +90,20 @@ class TestQuadraticCells:
     def test_a_thin_region_is_named(self, tmp_path):
         box = box_hexahedra((0.1, 0.03, 0.03), (6, 3, 3))
         layer = box.vertices[box.cells].mean(axis=1)[:, 2] < 0.01
-        regions = {"layer": np.flatnonzero(layer), "soft": np.flatnonzero(~layer), "whole": np.arange(len(box.cells))}
+        regions = {
+            "layer": np.flatnonzero(layer),
+            "soft": np.flatnonzero(~layer),
+            "whole": np.arange(len(box.cells)),
+        }
         write_mesh(tmp_path / "beam.msh", Mesh(box.vertices, box.cells, regions))
         rows = inspected(f"mesh.path={tmp_path}/beam.msh")
         assert rows["one cell thick"].startswith("layer: ")
         assert "held at the lower end along x" in rows["quadratic cells"]
         write_mesh(tmp_path / "beam.msh", quadratic(Mesh(box.vertices, box.cells, regions)))
-        assert not {"one cell thick", "quadratic cells"} & inspected(f"mesh.path={tmp_path}/beam.msh").keys()
+        assert (
+            not {"one cell thick", "quadratic cells"}
+            & inspected(f"mesh.path={tmp_path}/beam.msh").keys()
+        )
 
 
 def test_closed_chambers_are_none_without_its_last_cap(arm):
@@ -98,7 +112,9 @@ def test_closed_chambers_are_none_without_its_last_cap(arm):
     mesh, _ = arm
     cavities = open_cavities(without(mesh, mesh.vertices[mesh.cells].mean(axis=1)[:, 2] < -0.271))
     assert len(cavities) == 3
-    around = sorted(np.degrees(np.arctan2(cavity.centre[1], cavity.centre[0])) for cavity in cavities)
+    around = sorted(
+        np.degrees(np.arctan2(cavity.centre[1], cavity.centre[0])) for cavity in cavities
+    )
     assert around == pytest.approx([-120.0, 0.0, 120.0], abs=1.0)
     assert all(3e-3 < cavity.area < 6e-3 for cavity in cavities)
 
@@ -109,11 +125,16 @@ class TestNamedSurfaces:
         inside = mesh.cells[:1, [0, 1, 2, 3]]
         assert not np.any(np.all(np.sort(boundary_faces(mesh), axis=1) == np.sort(inside), axis=1))
         write_mesh(tmp_path / "arm.msh", mesh, {**surfaces, "middle": inside})
-        with pytest.warns(ResphysWarning, match=r"arm\.msh: the surface 'middle' is left out, as no face of it is on"):
+        with pytest.warns(
+            ResphysWarning,
+            match=r"arm\.msh: the surface 'middle' is left out, as no face of it is on",
+        ):
             assert set(read_surfaces(tmp_path / "arm.msh")) == set(surfaces)
         partly = np.concatenate([inside, boundary_faces(mesh)[:1]])
         write_mesh(tmp_path / "arm.msh", mesh, {"middle": partly})
-        with pytest.raises(MeshError, match=r"arm\.msh: 1 of 2 faces of the surface 'middle' are not on the body's"):
+        with pytest.raises(
+            MeshError, match=r"arm\.msh: 1 of 2 faces of the surface 'middle' are not on the body's"
+        ):
             read_surfaces(tmp_path / "arm.msh")
 
     @pytest.mark.parametrize("kind", ["tetrahedron10", "tetrahedron"])
@@ -125,8 +146,20 @@ class TestNamedSurfaces:
         np.testing.assert_array_equal(read_surfaces(tmp_path / "box.msh")["all"], surfaces["all"])
 
     def test_unknown_extension(self, tmp_path, arm):
-        refuses(MeshError, r"meshio does not know the extension '\.arm'", write_mesh, tmp_path / "mesh.arm", arm[0])
-        refuses(MeshError, r"mesh\.stl: meshio cannot write such a file", write_mesh, tmp_path / "mesh.stl", arm[0])
+        refuses(
+            MeshError,
+            r"meshio does not know the extension '\.arm'",
+            write_mesh,
+            tmp_path / "mesh.arm",
+            arm[0],
+        )
+        refuses(
+            MeshError,
+            r"mesh\.stl: meshio cannot write such a file",
+            write_mesh,
+            tmp_path / "mesh.stl",
+            arm[0],
+        )
         assert not list(tmp_path.iterdir())
 
 
@@ -164,17 +197,26 @@ def test_a_body_in_two_pieces_with_an_open_chamber(tmp_path, arm):
 
 def test_an_arm_is_written_as_it_is_described(tmp_path, capsys, used_again):
     with used_again():
-        inspect(settings_of(Inspection, "inspect", "mesh=arm_generated", "mesh.layers=0.03", "save=own.msh"), tmp_path)
+        inspect(
+            settings_of(
+                Inspection, "inspect", "mesh=arm_generated", "mesh.layers=0.03", "save=own.msh"
+            ),
+            tmp_path,
+        )
     rows = rows_of(capsys.readouterr().out.partition("Written: ")[0])
     mesh = read_mesh(tmp_path / "own.msh")
-    assert rows["vertices"] == f"{len(mesh.vertices)} = {3 * len(mesh.vertices):,} degrees of freedom"
+    assert (
+        rows["vertices"] == f"{len(mesh.vertices)} = {3 * len(mesh.vertices):,} degrees of freedom"
+    )
     assert set(read_surfaces(tmp_path / "own.msh")) == set(name_surfaces(mesh))
     assert rows["mass"].startswith(f"{1070e3 * cell_volumes(mesh).sum():.1f} g")
     picture = imread(tmp_path / "mesh.png")[..., :3]
     colours = {"chamber 1": (0.90, 0.62, 0.0), "chamber 4": (0.84, 0.37, 0.0)}
     views = picture[: int(0.85 * len(picture))]  # without the legend
     for colour in colours.values():
-        hue = np.abs(views / views.max(axis=2, keepdims=True).clip(0.1) - np.array(colour) / max(colour)).max(axis=2)
+        hue = np.abs(
+            views / views.max(axis=2, keepdims=True).clip(0.1) - np.array(colour) / max(colour)
+        ).max(axis=2)
         assert (hue < 0.05).sum() > 2000
 
 
@@ -188,13 +230,19 @@ def test_an_arm_is_written_as_it_is_described(tmp_path, capsys, used_again):
 )
 def test_wrong_settings(tmp_path, overrides, error, message):
     with pytest.raises(error, match=message):
-        inspect(settings_of(Inspection, "inspect", "mesh=arm_generated", "save=arm.msh", *overrides), tmp_path)
+        inspect(
+            settings_of(Inspection, "inspect", "mesh=arm_generated", "save=arm.msh", *overrides),
+            tmp_path,
+        )
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["mesh=arm_generated", "mesh.wall=0.02"], "error: where the arm's radius is 21.29 mm, 3 chambers do not fit"),
+        (
+            ["mesh=arm_generated", "mesh.wall=0.02"],
+            "error: where the arm's radius is 21.29 mm, 3 chambers do not fit",
+        ),
         (["nowhere.vtk"], "error: nowhere.vtk: there is no such mesh file"),
         ([], "error: nothing to inspect: name a mesh or a recording"),
     ],
@@ -204,11 +252,16 @@ def test_commands_end_with_one_sentence(folder, arguments, message):
 
 
 def test_a_file_of_a_surface_is_filled(tmp_path):
-    """An STL is inspected by its name alone, in mm, as by mesh=surface; the size of its cells may be given."""
+    """An STL is inspected by its name alone, in mm, as by mesh=surface.
+
+    The size of its cells may be given.
+    """
     gmsh = pytest.importorskip("gmsh")
     assert gmsh
     trimesh.creation.box((40.0, 20.0, 10.0)).export(tmp_path / "box.stl")
-    settings = settings_of(Inspection, "inspect", f"files=[{tmp_path / 'box.stl'}]", "mesh.size=0.01")
+    settings = settings_of(
+        Inspection, "inspect", f"files=[{tmp_path / 'box.stl'}]", "mesh.size=0.01"
+    )
     assert (settings.mesh.kind, settings.mesh.units, settings.mesh.size) == ("surface", "mm", 0.01)
     rows = inspected(f"files=[{tmp_path / 'box.stl'}]", "mesh.size=0.01")
     assert rows["cells"].endswith("tetrahedron10")

@@ -42,7 +42,8 @@ def path(tmp_path):
 
 def test_table_and_files(tmp_path, path):
     text = inspect_recording(
-        configured(f"recording.path={path}", "still=[base 1, base 2]", "moving=[tip]"), tmp_path / "out"
+        configured(f"recording.path={path}", "still=[base 1, base 2]", "moving=[tip]"),
+        tmp_path / "out",
     )
     rows = text.splitlines()
     assert rows[0].split()[:6] == ["marker", "seen", "gaps", "longest", "masked", "jumps"]
@@ -60,20 +61,27 @@ def test_table_and_files(tmp_path, path):
 def test_ranges_of_force_sensors_are_printed(tmp_path):
     loads = np.full((200, 6), np.nan)
     loads[:, 2], loads[5:, 4] = np.linspace(-0.5, 0.25, 200), 0.125
-    write_recording(tmp_path / "push.h5", replace(held_then_initial_motion(), loads={"plate": loads}))
+    write_recording(
+        tmp_path / "push.h5", replace(held_then_initial_motion(), loads={"plate": loads})
+    )
     said = inspect_recording(configured(f"files=[{tmp_path / 'push.h5'}]"), tmp_path)
     assert "\nForce sensor plate: fz -0.5 to 0.25 N, ty 0.125 to 0.125 N m.\n" in f"{said}\n"
 
 
 def test_trials_are_compared(tmp_path, path):
-    config = configured(f"recording.path={path}", "still=[base 1, base 2]", f"compare_with=[{tmp_path}/other.h5]")
+    config = configured(
+        f"recording.path={path}", "still=[base 1, base 2]", f"compare_with=[{tmp_path}/other.h5]"
+    )
     write_recording(tmp_path / "other.h5", held_then_initial_motion(base=0.002))
     text = inspect_recording(config, tmp_path / "out")
     assert "other.h5: the base is shifted by up to 2.00 mm; its markers moved by up to 0.0" in text
     write_recording(tmp_path / "other.h5", held_then_initial_motion(base=0.03))
     with pytest.raises(DataFileError, match=r"other\.h5: base marker base 1 moved by \d+\.\d\d mm"):
         inspect_recording(config, tmp_path / "out")
-    assert json.loads((tmp_path / "out" / "quality.json").read_text())["base"][0]["shift_mm"]["base 2"] > 29.0
+    assert (
+        json.loads((tmp_path / "out" / "quality.json").read_text())["base"][0]["shift_mm"]["base 2"]
+        > 29.0
+    )
 
 
 def test_picture_shows_what_is_seen_filled_and_masked():
@@ -93,14 +101,22 @@ def test_picture_shows_what_is_seen_filled_and_masked():
     colours = [tuple(image[0, frame]) for frame in (0, 101, 160)]
     assert colours == [to_rgb("#dde1e6"), to_rgb("#e69f00"), to_rgb("#c4481b")]
     np.testing.assert_array_equal(image[2], np.tile(colours[2], (200, 1)))
-    jumps = [line.get_xdata() for line in raster.lines if line.get_marker() == "|" and len(line.get_xdata())]
+    jumps = [
+        line.get_xdata()
+        for line in raster.lines
+        if line.get_marker() == "|" and len(line.get_xdata())
+    ]
     np.testing.assert_allclose(jumps, [[0.905]])
     figure.canvas.draw()
 
 
 def test_files_are_told_by_their_ends():
     settings = configured("files=[a.c3d,body.vtk,b.h5]")
-    assert (settings.recording.path, settings.compare_with, settings.mesh.path) == ("a.c3d", ("b.h5",), "body.vtk")
+    assert (settings.recording.path, settings.compare_with, settings.mesh.path) == (
+        "a.c3d",
+        ("b.h5",),
+        "body.vtk",
+    )
     refuses(InputError, r"^a\.msh and b\.msh are two meshes", configured, "files=[a.msh,b.msh]")
 
 
@@ -114,4 +130,8 @@ def test_files_are_told_by_their_ends():
     ],
 )
 def test_wrong_settings(tmp_path, path, overrides, message):
-    refuses(InputError, message, lambda: inspect_recording(configured(f"recording.path={path}", *overrides), tmp_path))
+    refuses(
+        InputError,
+        message,
+        lambda: inspect_recording(configured(f"recording.path={path}", *overrides), tmp_path),
+    )

@@ -1,4 +1,6 @@
-"""A robot that is stepped as time goes on, its twin, by a trial, a file or over UDP, and their page in a browser."""
+"""A robot that is stepped as time goes on, its twin, by a trial,
+a file or over UDP, and their page in a browser.
+"""
 
 import json
 import re
@@ -106,10 +108,15 @@ def test_a_port_in_use_and_a_missing_package_are_said(finished, folder, monkeypa
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         said = refusal("view", f"run={finished[0]}", f"port={port}")
-    assert said.startswith(f"error: port {port} of 127.0.0.1 cannot be used (Address already in use): choose another")
+    assert said.startswith(
+        f"error: port {port} of 127.0.0.1 cannot be used (Address already in use): choose another"
+    )
     monkeypatch.setitem(sys.modules, "viser", None)
     said = refusal("view", f"run={finished[0]}", "port=0").splitlines()[-1]
-    assert said == "error: the viewer needs a package that is not installed: pip install 'warp-resphys[view]'."
+    assert (
+        said == "error: the viewer needs a package that is not installed: pip install "
+        "'warp-resphys[view]'."
+    )
 
 
 def test_a_command_serves_it(finished, folder, monkeypatch):
@@ -160,14 +167,23 @@ def test_a_browser_drives_and_pulls_it(finished):
                 until(lambda: "pictures a second" in browser.page_source, PATIENCE)
                 canvas = browser.find_element(By.CSS_SELECTOR, "canvas")
                 hand = webdriver.ActionChains(browser)
-                hand.move_to_element_with_offset(canvas, 0, 0).click_and_hold().move_by_offset(0, -40)
+                hand.move_to_element_with_offset(canvas, 0, 0).click_and_hold().move_by_offset(
+                    0, -40
+                )
                 hand.move_by_offset(0, -60).perform()
                 until(lambda: live.held is not None, PATIENCE)
                 observed["pulled"] = True
                 webdriver.ActionChains(browser).release().perform()
                 until(lambda: live.held is None, PATIENCE)
-                severe = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
-                observed["severe"] = [entry for entry in severe if "passive event listener" not in entry]  # viser's own
+                severe = [
+                    entry["message"]
+                    for entry in browser.get_log("browser")
+                    if entry["level"] == "SEVERE"
+                ]
+                # Viser's own.
+                observed["severe"] = [
+                    entry for entry in severe if "passive event listener" not in entry
+                ]
                 browser.find_element(By.XPATH, "//button[.='Pause']").click()
                 until(lambda: browser.find_elements(By.XPATH, "//button[.='Go on']"), PATIENCE)
                 before, drawn = live.time, page.pictures
@@ -182,12 +198,15 @@ def test_a_browser_drives_and_pulls_it(finished):
         observed = {}
         thread = threading.Thread(target=look)
         thread.start()
-        page.run(None)  # In this thread, as from the command line, until the other one has seen everything.
+        # In this thread, as from the command line, until the other one has seen everything.
+        page.run(None)
         thread.join()
     assert observed == {"pulled": True, "severe": [], "paused": True, "reset": True}
 
 
-SETTINGS = TwinSettings(horizon=0.02, patience=0.3, align=False, refine={}, noise=1e-4, planned=False, engine="full")
+SETTINGS = TwinSettings(
+    horizon=0.02, patience=0.3, align=False, refine={}, noise=1e-4, planned=False, engine="full"
+)
 
 
 @pytest.fixture
@@ -224,12 +243,18 @@ def test_it_follows_a_file(robot, folder):
     live = played(LiveTwin(robot, "swing.csv", SETTINGS))
     assert live.time == pytest.approx(trial.times[-1])
     assert np.linalg.norm(live.positions - trial.play(robot).q[-1, 0].numpy(), axis=1).mean() < 2e-4
-    with pytest.raises(InputError, match="source is 'nothing': give udp://HOST:PORT, a trial of the run"):
+    with pytest.raises(
+        InputError, match="source is 'nothing': give udp://HOST:PORT, a trial of the run"
+    ):
         LiveTwin(robot, "nothing", SETTINGS)
 
 
 def test_the_commands_of_a_recording_are_its_plan():
-    packets = [Packet(0.0, {}, {"pressure": [1.0]}), Packet(0.1, {}, {}), Packet(0.2, {}, {"pressure": [2.0]})]
+    packets = [
+        Packet(0.0, {}, {"pressure": [1.0]}),
+        Packet(0.1, {}, {}),
+        Packet(0.2, {}, {"pressure": [2.0]}),
+    ]
     first, *others = planned_packets(packets)
     assert first.plan == [(0.0, {"pressure": [1.0]}), (0.2, {"pressure": [2.0]})]
     assert others == packets[1:]
@@ -242,7 +267,11 @@ def test_it_takes_packets_over_udp_and_goes_on_after_wrong_ones(robot):
     rest = robot.begin().q[0].numpy()
     markers = {f"vertex_{number}": place.tolist() for number, place in enumerate(rest[:40])}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for text in ({"time": 1.0, "markers": markers}, {"time": 1.01, "inputs": {"wind": 1}}, {"time": 1.02}):
+        for text in (
+            {"time": 1.0, "markers": markers},
+            {"time": 1.01, "inputs": {"wind": 1}},
+            {"time": 1.02},
+        ):
             sender.sendto(json.dumps(text).encode(), (host, int(port)))
     until_time = time.monotonic() + 20.0
     while live.time < 1.0 and time.monotonic() < until_time:

@@ -1,4 +1,6 @@
-"""The search for settings of a training: its study, the settings that it prints, and what it refuses."""
+"""The search for settings of a training: its study,
+the settings that it prints, and what it refuses.
+"""
 
 import contextlib
 import re
@@ -19,14 +21,23 @@ from warp_resphys.studies.tuning import TunedRun, _checked
 SPACE = "tune.space.network={width: [8, 16], blocks: {low: 1, high: 2}}"
 SEARCH = ["tune", *TINY, "trainer.epochs=6", "tune.settings.trainer.rollout_every=3", SPACE]
 REFUSED = [
-    (["experiment=marker_ablation"], "tune.model is 'resphys': the experiment marker_ablation trains none"),
+    (
+        ["experiment=marker_ablation"],
+        "tune.model is 'resphys': the experiment marker_ablation trains none",
+    ),
     (["tune.model=sysid"], "trains 'simfree', 'resphys'"),
     (["experiment=beam_real", "data.folder=recordings"], "set data.folds to null"),
-    (["experiment=beam_real_repeated", "data.folder=recordings"], "do not depend on tune's trainer.schedule"),
+    (
+        ["experiment=beam_real_repeated", "data.folder=recordings"],
+        "do not depend on tune's trainer.schedule",
+    ),
     (["tune.space.network.colour=[1,2]"], "unknown key 'network.colour'"),
     (["tune.space.network.width=[8,-1]"], "network.width is -1"),
     (["tune.space.network.width=[8]"], "tune.space.network.width is [8]: write two or more values"),
-    (["tune.space.network.layers={high:many}"], "tune.space.network.layers is {'low': 2, 'high': 'many'}: write two"),
+    (
+        ["tune.space.network.layers={high:many}"],
+        "tune.space.network.layers is {'low': 2, 'high': 'many'}: write two",
+    ),
     (["~tune.space.network", "~tune.space.trainer"], "tune.space is empty"),
 ]
 
@@ -72,7 +83,9 @@ def test_the_same_command_adds_trials_after_an_interruption_but_other_settings_h
         patch.setattr(Trainer, "run_epoch", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
         code, err = run(*SEARCH, "tune.trials=4", IN_RUN)
     assert (code, "interrupted in trial 3" in err) == (130, True)
-    assert [trial.state for trial in study(root).trials] == 3 * [TrialState.COMPLETE] + [TrialState.FAIL]
+    assert [trial.state for trial in study(root).trials] == 3 * [TrialState.COMPLETE] + [
+        TrialState.FAIL
+    ]
     assert run(*SEARCH, "tune.trials=4", IN_RUN)[0] == 0
     assert [trial.state for trial in study(root).trials][4:] == [TrialState.COMPLETE]
     assert len({trial.params["network.width"] for trial in study(root).trials}) <= 2
@@ -86,7 +99,10 @@ def test_a_trial_that_is_worse_than_others_is_stopped(searched, tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(optuna.trial.Trial, "should_prune", lambda self: self.number == 1)
     assert run(*SEARCH, "tune.trials=2", IN_RUN)[0] == 0
-    assert [trial.state for trial in study(tmp_path).trials] == [TrialState.COMPLETE, TrialState.PRUNED]
+    assert [trial.state for trial in study(tmp_path).trials] == [
+        TrialState.COMPLETE,
+        TrialState.PRUNED,
+    ]
 
 
 @pytest.mark.parametrize(("arguments", "said"), REFUSED)

@@ -10,7 +10,9 @@ CENTRES = 300
 
 
 def network_of(change, highest, parts, filters=()):
-    """A network that nearly adds change(x), (S, C) of (S, C (1 + F)) inputs and means between zero and the highest."""
+    """A network that nearly adds change(x), (S, C) of (S, C (1 + F)) inputs
+    and means between zero and the highest.
+    """
     shape = (2000, parts * (1 + len(filters)))
     values = torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     values[::2] = values[::2].round()  # corners of the range
@@ -25,5 +27,7 @@ def network_of(change, highest, parts, filters=()):
 def functions_of(network, values):
     """(S, N) what weights of one of the basis functions add."""
     network = deepcopy(network)
-    network.weights = torch.nn.Parameter(torch.eye(len(network.weights)).double(), requires_grad=False)
+    network.weights = torch.nn.Parameter(
+        torch.eye(len(network.weights)).double(), requires_grad=False
+    )
     return network(values)

@@ -28,7 +28,9 @@ def opened() -> Iterator[Any]:
     webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
     program, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if program is None or driver is None:
-        pytest.skip("there is no Chromium with its driver (Debian's packages chromium and chromium-driver)")
+        pytest.skip(
+            "there is no Chromium with its driver (Debian's packages chromium and chromium-driver)"
+        )
     options = webdriver.ChromeOptions()
     options.binary_location = program
     for option in _OPTIONS:

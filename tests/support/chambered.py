@@ -44,7 +44,9 @@ def force_of(s, q, pressure):
     placed = [PlacedEnergy(energy, energy.points(s.body.mesh))]
     potential = IncrementalPotential(placed, s.body.coordinates, none, len(q), q.device)
     zeros = torch.zeros_like(q)
-    potential.set_terms(StepTerms(zeros, zeros[..., 0], zeros, [{"pressure": pressure, "apex": None}]))
+    potential.set_terms(
+        StepTerms(zeros, zeros[..., 0], zeros, [{"pressure": pressure, "apex": None}])
+    )
     potential.positions.copy_(q)
     potential.evaluate()
     return -potential.residual

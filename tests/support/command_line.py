@@ -22,7 +22,9 @@ class Outcome(NamedTuple):
 
 
 def enable_loggers() -> None:
-    """Undoes the silence after a run whose logging Hydra has disabled, which lasts in this process."""
+    """Undoes the silence after a run whose logging Hydra has disabled,
+    which lasts in this process.
+    """
     logging.root.setLevel(logging.WARNING)
     for name in logging.root.manager.loggerDict:
         logging.getLogger(name).disabled = False

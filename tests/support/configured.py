@@ -16,7 +16,11 @@ def _composed(*overrides):
 
 def composed(*overrides):
     """Nested plain settings with all defaults."""
-    own = [word for word in overrides if not word.startswith("hydra") or word.startswith("hydra.searchpath")]
+    own = [
+        word
+        for word in overrides
+        if not word.startswith("hydra") or word.startswith("hydra.searchpath")
+    ]
     return copy.deepcopy(_composed(*own))
 
 

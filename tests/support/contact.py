@@ -7,7 +7,15 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from warp_resphys import Body, Contact, Corotated, HalfSpace, Simulator, box_hexahedra, select_vertices
+from warp_resphys import (
+    Body,
+    Contact,
+    Corotated,
+    HalfSpace,
+    Simulator,
+    box_hexahedra,
+    select_vertices,
+)
 from warp_resphys.energies.contact.contact_points import vertex_areas
 from warp_resphys.energies.contact.pairs import PairList, Surface
 from warp_resphys.energies.launcher import Launcher
@@ -22,11 +30,21 @@ WEIGHT = SOFT.density * SIDE**3 * G  # N
 
 
 def on_obstacles(
-    obstacles, mu=0.0, material=SOFT, mesh=BLOCK, fixed=(), slip_speed=1e-3, distance=D, kappa=KAPPA, **options
+    obstacles,
+    mu=0.0,
+    material=SOFT,
+    mesh=BLOCK,
+    fixed=(),
+    slip_speed=1e-3,
+    distance=D,
+    kappa=KAPPA,
+    **options,
 ):
     """A simulator of a body with obstacles."""
     obstacles = obstacles if isinstance(obstacles, dict) else {"obstacle": obstacles}
-    contact = Contact(obstacles, stiffness=kappa, friction=mu, distance=distance, slip_speed=slip_speed)
+    contact = Contact(
+        obstacles, stiffness=kappa, friction=mu, distance=distance, slip_speed=slip_speed
+    )
     options = {"time_step": 5e-3, "gravity": (0.0, 0.0, -G), **options}
     return Simulator(Body(mesh, fixed=fixed, energies=[contact]), material, **options)
 
@@ -60,7 +78,9 @@ def distances(obstacle: Obstacle, x: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def crossings_and_gap(mesh, path: torch.Tensor, reach: float) -> tuple[int, float]:
-    """Number of positions (T, N, 3) [m] at which surfaces cross, and their least distance [m] within reach."""
+    """Number of positions (T, N, 3) [m] at which surfaces cross,
+    and their least distance [m] within reach.
+    """
     pairs = PairList(Launcher(1, path.device), Surface.of(mesh), reach)
     crossed, gap = 0, math.inf
     for q in path[:, None].double():

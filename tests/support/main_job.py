@@ -11,7 +11,15 @@ from support.command_line import outcome
 from warp_resphys import pipeline
 
 REPOSITORY = Path(__file__).parents[2]
-STAGES = ["simulate", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate", "time", "report"]
+STAGES = [
+    "simulate",
+    "reconstruct_resphys",
+    "train_resphys",
+    "train_simfree",
+    "evaluate",
+    "time",
+    "report",
+]
 LEARNED = ["train_resphys", "train_simfree", "evaluate", "time", "report"]
 CORRECTED = ["reconstruct_resphys", "train_resphys", "evaluate", "time", "report"]
 MODELS = ("simulation", "resphys", "reconstruction")
@@ -32,14 +40,15 @@ TINY = [*SMALL, *SHORT]
 IN_RUN = "hydra.run.dir=run"
 DRIVEN = [  # a driven robot with a laboratory, in seconds
     *("data.sequences=5", "data.train=3", "data.validation=1", "data.test=1", "data.horizons=[]"),
-    *("data.rest_seconds=0.01", "data.cutoff=20.0", "parallel={processes:1,batch:3}", "timing=false"),
+    "data.rest_seconds=0.01",
+    "data.cutoff=20.0",
+    "parallel={processes:1,batch:3}",
+    "timing=false",
     *("laboratory.sequences.rest=0.01", "laboratory.sequences.correlation_time=0.06"),
-    *(
-        "identify.trials=1",
-        "identify.seconds=0.1",
-        "identify.max_evaluations=3",
-        "trainer={epochs:4,rollout_every:2,gate:false}",
-    ),
+    "identify.trials=1",
+    "identify.seconds=0.1",
+    "identify.max_evaluations=3",
+    "trainer={epochs:4,rollout_every:2,gate:false}",
     *("network={position_modes:2,velocity_modes:2,force_modes:2,width:8}", "trainer.batch_size=16"),
     "actuation.filter_time_constants=[0.1]",
 ]
@@ -52,7 +61,9 @@ def without_reports():
     """Replaces reports, which take most of a tiny run's time and have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
         for name in ("make_report", "make_folds_report"):
-            patch.setattr(pipeline, name, lambda context: (context.run_dir / "report.html").write_text("-"))
+            patch.setattr(
+                pipeline, name, lambda context: (context.run_dir / "report.html").write_text("-")
+            )
         yield
 
 
@@ -87,8 +98,12 @@ def errors(folder="run"):
     """All errors of a run as one list [mm]."""
     content = metrics(folder)
     groups = [content["errors_mm"], content["errors_vs_reconstruction_mm"]]
-    values = [group[model][key] for group in groups for model in sorted(group) for key in ("mean", "std")]
-    return values + [trial["errors_mm"][model] for trial in content["per_trajectory"] for model in MODELS]
+    values = [
+        group[model][key] for group in groups for model in sorted(group) for key in ("mean", "std")
+    ]
+    return values + [
+        trial["errors_mm"][model] for trial in content["per_trajectory"] for model in MODELS
+    ]
 
 
 def same_errors(a, b):
@@ -98,5 +113,7 @@ def same_errors(a, b):
 def files(folder="run"):
     """Times and contents of all files in the run folder, except Hydra's, by name."""
     root = Path(folder)
-    paths = [p for p in root.rglob("*") if p.is_file() and ".hydra" not in p.parts and p.name != ".lock"]
+    paths = [
+        p for p in root.rglob("*") if p.is_file() and ".hydra" not in p.parts and p.name != ".lock"
+    ]
     return {str(p.relative_to(root)): (p.stat().st_mtime_ns, p.read_bytes()) for p in paths}

@@ -25,8 +25,10 @@ def check_robots(folder, models=("simulation", "sysid", "simfree", "resphys"), t
                 again = trial.play(warp_resphys.load(kept))
             wanted = expected[model][row, : len(trial.times)]
             assert np.isfinite(wanted).all()
-            assert np.abs(wanted - wanted[:1]).max() > 1e3 * tolerance or len(wanted) == 1  # There is something to see.
-            magnified = 100.0 if model == "simfree" else 1.0  # A network's states feed on themselves.
+            # There is something to see.
+            assert np.abs(wanted - wanted[:1]).max() > 1e3 * tolerance or len(wanted) == 1
+            # A network's states feed on themselves.
+            magnified = 100.0 if model == "simfree" else 1.0
             np.testing.assert_allclose(
                 trial.shown(motion), wanted, atol=magnified * tolerance, err_msg=f"{model}, {name}"
             )

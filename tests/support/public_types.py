@@ -1,4 +1,6 @@
-"""The types of the public names as a type checker sees them: mypy reads this file, and nothing runs it."""
+"""The types of the public names as a type checker sees them:
+mypy reads this file, and nothing runs it.
+"""
 
 from typing import Any, assert_type
 

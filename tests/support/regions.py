@@ -13,10 +13,13 @@ def beam(cells=(10, 3, 3)):
 
 def two_boxes(gap=0.0):
     """A box of 2 x 2 cells in section, and one of 3 x 3 that begins where it ends."""
-    one, two = box_hexahedra((0.05, 0.03, 0.03), (5, 2, 2)), box_hexahedra((0.05, 0.03, 0.03), (5, 3, 3))
+    one = box_hexahedra((0.05, 0.03, 0.03), (5, 2, 2))
+    two = box_hexahedra((0.05, 0.03, 0.03), (5, 3, 3))
     vertices = np.concatenate([one.vertices, two.vertices + [0.05 + gap, 0.0, 0.0]])
     cells = np.concatenate([one.cells, two.cells + len(one.vertices)])
     first = np.arange(len(one.cells))
     mesh = Mesh(vertices, cells, {"left": first, "right": np.arange(len(first), len(cells))})
-    ends = np.flatnonzero(np.isclose(vertices[:, 0], 0.05 + gap) & (np.arange(len(vertices)) >= len(one.vertices)))
+    ends = np.flatnonzero(
+        np.isclose(vertices[:, 0], 0.05 + gap) & (np.arange(len(vertices)) >= len(one.vertices))
+    )
     return mesh, ends

@@ -17,13 +17,22 @@ class Page(HTMLParser):
 
     def __init__(self, path):
         super().__init__()
-        self.links, self.images, self.text, self.scripts, self.data, self.inside = [], [], "", [], [], None
+        self.links, self.images, self.text, self.scripts, self.data, self.inside = (
+            [],
+            [],
+            "",
+            [],
+            [],
+            None,
+        )
         self.source = path.read_text(encoding="utf-8")
         self.feed(self.source)
         self.text = " ".join(self.text.replace("\u00a0", " ").split())
 
     def handle_starttag(self, tag, attrs):
-        self.links += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data")]
+        self.links += [
+            value or "" for name, value in attrs if name in ("src", "href", "srcset", "data")
+        ]
         if tag == "script":
             self.inside = self.scripts if dict(attrs).get("type") is None else self.data
             self.inside.append("")
@@ -49,10 +58,15 @@ class Page(HTMLParser):
 
     def allows_its_scripts_alone(self):
         """Whether the content security policy allows exactly the page's own scripts."""
-        digests = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in self.scripts]
+        digests = [
+            base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+            for script in self.scripts
+        ]
         policy = self.source.partition("Content-Security-Policy")[2].partition(">")[0]
         allowed = policy.partition("script-src ")[2].partition(";")[0].rstrip('"').split()
-        return "default-src 'none'" in policy and allowed == [f"'sha256-{digest}'" for digest in digests]
+        return "default-src 'none'" in policy and allowed == [
+            f"'sha256-{digest}'" for digest in digests
+        ]
 
 
 def skip_figures(patch):

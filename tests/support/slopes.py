@@ -7,7 +7,8 @@ _POINTS = (-2.0, -1.0, 1.0, 2.0)  # of a difference, in changes
 
 
 def check_slopes(loss, values, sizes, seed=3, tolerance=1e-6, together=False):
-    """Compares gradients of a loss with differences of five points along a random direction of every value.
+    """Compares gradients of a loss with differences
+    of five points along a random direction of every value.
 
     Args:
         loss: function of the values by name, a number or (B,) with one for each environment.
@@ -15,17 +16,22 @@ def check_slopes(loss, values, sizes, seed=3, tolerance=1e-6, together=False):
         sizes: of the changes by name, so small that no point begins or ends to touch or slide.
         seed: of the directions.
         tolerance: of a difference, relative to its size.
-        together: whether the loss takes all points of all differences at once, as so many times the environments.
+        together: whether the loss takes all points of all differences at once, as so many times the
+            environments.
     """
     random = torch.Generator().manual_seed(seed)
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
     result = loss(leaves)
     result.sum().backward()
     changes = {
-        name: sizes[name] * torch.randn(value.shape, generator=random, dtype=torch.float64).to(value.device)
+        name: sizes[name]
+        * torch.randn(value.shape, generator=random, dtype=torch.float64).to(value.device)
         for name, value in values.items()
     }
-    points = {name: [value + factor * changes[name] for factor in _POINTS] for name, value in values.items()}
+    points = {
+        name: [value + factor * changes[name] for factor in _POINTS]
+        for name, value in values.items()
+    }
     with torch.no_grad():
         if together:
             every = [{**values, name: point} for name in values for point in points[name]]
@@ -42,13 +48,20 @@ def check_slopes(loss, values, sizes, seed=3, tolerance=1e-6, together=False):
 
 
 def check_rows(rows, *names, bound=1e-6):
-    """Returns rows of `check_gradients` by parameter, all right within a bound, the named ones among them."""
+    """Returns rows of `check_gradients` by parameter,
+    all right within a bound, the named ones among them.
+    """
     found = {row.parameter: row for row in rows}
     assert {*names} <= found.keys()
-    assert {name: row.relative_error for name, row in found.items() if not row.relative_error <= bound} == {}
+    assert {
+        name: row.relative_error for name, row in found.items() if not row.relative_error <= bound
+    } == {}
     return found
 
 
 def differences(function, x, step):
     """Central differences of a function by every entry of an array (K,), one for each."""
-    return [(function(x + change) - function(x - change)) / (2.0 * step) for change in step * np.eye(len(x))]
+    return [
+        (function(x + change) - function(x - change)) / (2.0 * step)
+        for change in step * np.eye(len(x))
+    ]

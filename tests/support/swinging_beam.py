@@ -20,7 +20,9 @@ def double(values):
 
 
 def blank(frames=12, masses=(0.0, 0.05), rate=100.0):
-    """Motions under masses at the tip, whose markers stand a little off from where they were held."""
+    """Motions under masses at the tip, whose markers stand a little off
+    from where they were held.
+    """
     count = len(masses)
     times = (torch.arange(frames, dtype=torch.float64) / rate).expand(count, -1)
     held = torch.as_tensor(POINTS).expand(count, -1, -1)
@@ -32,9 +34,13 @@ def blank(frames=12, masses=(0.0, 0.05), rate=100.0):
 
 
 def simulated(replay, start, truth=None, observe=None, noise=0.0, seed=0):
-    """The replay with the markers that a simulation with the true parameters sees, with Gaussian noise [m]."""
+    """The replay with the markers that a simulation with the true parameters sees,
+    with Gaussian noise [m].
+    """
     real = Replay(replay.simulator, observe or replay.observe, replay.trials)
     with torch.no_grad():
         seen = real(start, {name: double([value]) for name, value in (truth or {}).items()})[0]
-    seen = seen + noise * torch.randn(seen.shape, generator=torch.Generator().manual_seed(seed), dtype=seen.dtype)
+    seen = seen + noise * torch.randn(
+        seen.shape, generator=torch.Generator().manual_seed(seed), dtype=seen.dtype
+    )
     return Replay(replay.simulator, replay.observe, replace(replay.trials, observed=seen))

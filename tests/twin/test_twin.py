@@ -26,7 +26,9 @@ def robot(finished):
 
 @pytest.fixture(scope="module")
 def swing(robot):
-    """Markers (T, N, 3) of a body that is let go from a bent shape, with noise, and its true states."""
+    """Markers (T, N, 3) of a body that is let go from a bent shape,
+    with noise, and its true states.
+    """
     start = robot.begin(external_force=pull(robot, 0.5))
     motion = robot.rollout(start, 60)
     noise = NOISE * np.random.default_rng(0).standard_normal(tuple(motion.q[:, 0].shape))
@@ -52,7 +54,9 @@ def followed(robot, frames, order=None, commands=None, **settings):
 
 def test_conditioning_is_that_of_normal_variables():
     random = np.random.default_rng(1)
-    root, slopes, residual = random.normal(size=(5, 5)), random.normal(size=(7, 5)), random.normal(size=7)
+    root = random.normal(size=(5, 5))
+    slopes = random.normal(size=(7, 5))
+    residual = random.normal(size=7)
     covariance = root @ root.T
     covariance[2] = covariance[:, 2] = 0.0  # a quantity that is known
     change, after = conditioned(covariance, slopes, residual, 0.3)
@@ -66,7 +70,9 @@ def test_conditioning_is_that_of_normal_variables():
 
 
 def test_what_is_not_seen_is_forgotten(robot):
-    """The force fades in a second, and parameters drift in ten, but never by more than was known before."""
+    """The force fades in a second, and parameters drift in ten,
+    but never by more than was known before.
+    """
     stiff = float(robot.simulator.defaults["youngs_modulus"])
     estimator = Twin(robot, refine={"youngs_modulus": 0.1 * stiff}).estimator
     belief, count, h = estimator.begin({}), len(estimator.tangent.frequencies), robot.time_step
@@ -83,7 +89,9 @@ def test_what_is_not_seen_is_forgotten(robot):
 
 def test_the_variance_of_steps_adapts_to_the_distances_of_frames():
     usual = np.sqrt(2.366)  # the median, of three coordinates
-    assert adapted(3.0, np.array([np.nan, usual, 1.1 * usual, 0.9 * usual])) == pytest.approx(3.0, rel=1e-3)
+    assert adapted(3.0, np.array([np.nan, usual, 1.1 * usual, 0.9 * usual])) == pytest.approx(
+        3.0, rel=1e-3
+    )
     assert adapted(3.0, np.full(4, np.nan)) == 3.0
     far, near = 1.0, 1.0
     for _ in range(5):  # frames after which the factor follows the squared distances
@@ -100,7 +108,10 @@ def test_a_step_is_linear_in_its_vibrations(robot):
     still = robot.step(robot.step(start))
     errors = np.zeros((2, count))
     errors[:, 0] = 2e-4 / tangent.size * np.array([1.0, tangent.frequencies[0]])
-    fields = [torch.einsum("r,rni->ni", torch.as_tensor(row).to(still.q), tangent.shapes)[None] for row in errors]
+    fields = [
+        torch.einsum("r,rni->ni", torch.as_tensor(row).to(still.q), tangent.shapes)[None]
+        for row in errors
+    ]
     moved, linear = shifted(robot, still, *fields), errors.ravel()
     for _ in range(10):
         moved, still = robot.step(moved), robot.step(still)
@@ -116,7 +127,9 @@ def test_a_force_shifts_the_equilibrium_by_what_it_is_named(robot):
     one = 1e-3 / tangent.size
     shifted_by = robot.begin(external_force=one * tangent.pull[0]).q[0] - robot.begin().q[0]
     expected = one * tangent.shapes[0]
-    assert float((shifted_by - expected).norm(dim=1).max()) < 0.05 * float(expected.norm(dim=1).max())
+    assert float((shifted_by - expected).norm(dim=1).max()) < 0.05 * float(
+        expected.norm(dim=1).max()
+    )
 
 
 def test_it_finds_a_state_that_it_was_not_given(robot, swing):
@@ -224,7 +237,9 @@ def test_it_refines_a_parameter_as_it_runs(robot):
     assert deviation < 0.1 * stiff
     assert abs(value - 1.2 * stiff) < 3.0 * deviation
     refuses(InputError, "there is no parameter 'wobble'", Twin, robot, refine={"wobble": 1.0})
-    refuses(InputError, r"refine\.youngs_modulus is -1", Twin, robot, refine={"youngs_modulus": -1.0})
+    refuses(
+        InputError, r"refine\.youngs_modulus is -1", Twin, robot, refine={"youngs_modulus": -1.0}
+    )
 
 
 def test_a_clock_that_is_set_back_and_a_gap_start_it_again(robot, swing):
@@ -272,16 +287,28 @@ def test_packets_over_udp_and_from_a_file(robot, folder):
     sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sent = {"time": 1.5, "markers": {"vertex_0": [0.0, 0.1, None]}, "inputs": {"payload": 0.1}}
     sent["plan"] = [{"time": 2.0, "inputs": {"payload": 0.2}}]
-    wrong = [b"{", b'{"markers": {}}', b'{"time": 1, "x": 2}', b'{"time": 1, "inputs": 2}', b"[" * 50_000]
+    wrong = [
+        b"{",
+        b'{"markers": {}}',
+        b'{"time": 1, "x": 2}',
+        b'{"time": 1, "inputs": 2}',
+        b"[" * 50_000,
+    ]
     wrong += [b'{"time": 1, "plan": {"payload": 1}}']
     wrong += [b'{"time": 1, "markers": {"vertex_0": [1]}}']
     for text in (json.dumps(sent).encode(), *wrong):
         sender.sendto(text, listener.address)
     packets, until = [], time.monotonic() + 10.0
-    while sum(listener.refused.values()) + len(packets) < 1 + len(wrong) and time.monotonic() < until:
+    while (
+        sum(listener.refused.values()) + len(packets) < 1 + len(wrong) and time.monotonic() < until
+    ):
         packets += listener.packets()
     (packet,) = packets
-    assert (packet.time, packet.inputs, packet.plan) == (1.5, {"payload": 0.1}, [(2.0, {"payload": 0.2})])
+    assert (packet.time, packet.inputs, packet.plan) == (
+        1.5,
+        {"payload": 0.1},
+        [(2.0, {"payload": 0.2})],
+    )
     np.testing.assert_array_equal(packet.markers["vertex_0"], [np.nan] * 3)
     assert sum(listener.refused.values()) == len(wrong)
     for words in (
@@ -320,7 +347,9 @@ def test_the_clamp_holds_the_estimated_body(robot, swing):
     frames, _, motion = swing
     rest = Twin(robot)
     rest.take(0.0)
-    weight = robot.simulator.prepare().load_mass.sum() * torch.tensor(robot.simulator.gravity, dtype=torch.float64)
+    weight = robot.simulator.prepare().load_mass.sum() * torch.tensor(
+        robot.simulator.gravity, dtype=torch.float64
+    )
     torch.testing.assert_close(rest.now.state.reaction.force[0], -weight, rtol=1e-5, atol=1e-7)
     twin, true, seen = Twin(robot, noise=NOISE), motion.reaction.force[:, 0], []
     for number, frame in enumerate(frames):
@@ -343,18 +372,24 @@ def test_predictions_follow_a_plan_of_commands(robot):
     height = ahead[:, fixed, 2] - rest[fixed, 2].numpy()
     np.testing.assert_allclose(height.mean(axis=1), [0.0, 0.0, 0.0, 0.0, 2e-3], atol=1e-6)
     twin.take(5 * h)
-    assert float((twin.now.state.q[0, fixed] - rest[fixed]).abs().max()) == 0.0  # a plan is no command
+    # a plan is no command
+    assert float((twin.now.state.q[0, fixed] - rest[fixed]).abs().max()) == 0.0
     twin.plan([(5.6 * h, {"base": lifted})])
     twin.take(5.5 * h)  # its step ends at 6 h, and what is planned before that acts from then on
     height = twin.ahead().markers[:, fixed, 2] - rest[fixed, 2].numpy()
     np.testing.assert_allclose(height.mean(axis=1), [0.0, 2e-3, 2e-3, 2e-3, 2e-3], atol=1e-6)
     twin.plan([])
     refuses(InputError, "there is no input 'wind'", twin.plan, [(0.1, {"wind": 1.0})])
-    assert twin.ahead(7 * h).markers[1, fixed[0], 2] - rest[fixed[0], 2] == pytest.approx(0.0, abs=1e-6)
+    assert twin.ahead(7 * h).markers[1, fixed[0], 2] - rest[fixed[0], 2] == pytest.approx(
+        0.0, abs=1e-6
+    )
 
 
 def test_its_transition_follows_the_body(robot):
-    """In a bent body a step has other derivatives than at rest; after a turn of renewals the twin has them."""
+    """In a bent body a step has other derivatives than at rest.
+
+    After a turn of renewals the twin has them.
+    """
     robot = robot.integrated_by("implicit_euler")
     force, estimator = pull(robot, 8.0), Twin(robot).estimator
     belief = estimator.begin({})
@@ -363,10 +398,14 @@ def test_its_transition_follows_the_body(robot):
         belief = estimator.advance(belief, {"external_force": force})
     moved, faster, pulled = estimator.tangent.changes(range(3 * count))
     after = robot.step(
-        shifted(robot, belief.state.select([0] * 6 * count), moved, faster), external_force=force + pulled
+        shifted(robot, belief.state.select([0] * 6 * count), moved, faster),
+        external_force=force + pulled,
     )
     expected = estimator.tangent.slopes(after, range(3 * count))
-    off, first = (np.abs(x - expected)[:count, :count].max() for x in (belief.transition, estimator.tangent.transition))
+    off, first = (
+        np.abs(x - expected)[:count, :count].max()
+        for x in (belief.transition, estimator.tangent.transition)
+    )
     assert first > 0.03
     assert off < 0.1 * first
     assert belief.pause == 8

@@ -1,4 +1,6 @@
-"""A twin of a robot that lies on an obstacle: it follows, and corrections do not move the body into the obstacle."""
+"""A twin of a robot that lies on an obstacle: it follows,
+and corrections do not move the body into the obstacle.
+"""
 
 import numpy as np
 import pytest
@@ -18,7 +20,9 @@ def beam(*given):
     place = f"position: [{PLACE[0]}, 0.015, {PLACE[1]}], axis: [0, 1, 0]"
     bar = f"{{shape: cylinder, {place}, radius: {RADIUS}, length: 0.06}}"
     contact = "contact={friction: 0.4, distance: 1e-3, slip_speed: 5e-3}"
-    run = settings("mesh.divisions=[10,2,2]", "integrator=bdf2", f"obstacles={{bar: {bar}}}", contact, *given)
+    run = settings(
+        "mesh.divisions=[10,2,2]", "integrator=bdf2", f"obstacles={{bar: {bar}}}", contact, *given
+    )
     mesh = box_hexahedra((0.1, 0.03, 0.03), (10, 2, 2))
     return Robot(Description("beam", "sysid", SimulatorSettings.of(run), run.simulation, mesh))
 
@@ -45,7 +49,9 @@ def followed(robot, motion):
     rest, truth = robot.simulator.rest_positions.numpy(), motion.q[:, 0].numpy()
     seen = np.concatenate([np.flatnonzero(np.isclose(rest[:, 0], x))[:3] for x in (0.05, 0.1)])
     frames = np.full(truth.shape, np.nan)
-    frames[:, seen] = truth[:, seen] + NOISE * np.random.default_rng(0).standard_normal((len(truth), 6, 3))
+    frames[:, seen] = truth[:, seen] + NOISE * np.random.default_rng(0).standard_normal(
+        (len(truth), 6, 3)
+    )
     twin, states = Twin(robot, noise=NOISE), []
     for number, frame in enumerate(frames):
         twin.take(number * robot.time_step, frame)
@@ -55,12 +61,24 @@ def followed(robot, motion):
 
 
 def test_a_twin_follows_a_body_that_lies_on_a_bar_but_not_what_moves(robot):
-    """The real beam is softer, is let go above the bar, and then pressed on it by a force unknown to the twin."""
-    real = robot.with_parameters(youngs_modulus=float(robot.description.material.values["youngs_modulus"]) * 0.9)
-    pressed = force(robot, 0.0, 0.15, -0.3) * torch.linspace(0.0, 1.0, 80, dtype=torch.float64)[:, None, None]
-    motion = real.rollout(real.begin(external_force=force(robot, 0.0, 0.1, 0.4)), external_force=pressed[:, None])
+    """The real beam is softer, is let go above the bar,
+    and then pressed on it by a force unknown to the twin.
+    """
+    real = robot.with_parameters(
+        youngs_modulus=float(robot.description.material.values["youngs_modulus"]) * 0.9
+    )
+    pressed = (
+        force(robot, 0.0, 0.15, -0.3)
+        * torch.linspace(0.0, 1.0, 80, dtype=torch.float64)[:, None, None]
+    )
+    motion = real.rollout(
+        real.begin(external_force=force(robot, 0.0, 0.1, 0.4)), external_force=pressed[:, None]
+    )
     twin, free = followed(robot, motion), robot.rollout(robot.begin(), 80).q[:, 0].numpy()
-    errors = [np.linalg.norm(q - motion.q[:, 0].numpy(), axis=2).mean(axis=1)[10:].mean() for q in (twin, free)]
+    errors = [
+        np.linalg.norm(q - motion.q[:, 0].numpy(), axis=2).mean(axis=1)[10:].mean()
+        for q in (twin, free)
+    ]
     assert errors[0] < 0.25 * errors[1]
     assert min(gap_of(q) for q in motion.q[:, 0]) < 1e-3  # They touch.
     assert min(map(gap_of, twin)) > 0.0

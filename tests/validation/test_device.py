@@ -9,7 +9,12 @@ SMALL += ["data.limit={train: 2, validation: 1, test: 1}"]
 SHORT = {
     "beam_oscillation": ["data.steps=20"],
     "beam_synthetic": ["data.seconds=0.3", "identify.max_evaluations=2"],
-    "tendon_rod": ["data.steps=60", "data.horizons=[0.3, 0.6]", "identify.seconds=0.3", "identify.max_evaluations=2"],
+    "tendon_rod": [
+        "data.steps=60",
+        "data.horizons=[0.3, 0.6]",
+        "identify.seconds=0.3",
+        "identify.max_evaluations=2",
+    ],
 }
 
 
@@ -23,7 +28,13 @@ def test_an_experiment_finishes_on_a_gpu(experiment, device, folder):
     """Every stage once, on few trials; other tests run them on a CPU."""
     if device == "cpu":
         pytest.skip("other tests run experiments on a CPU: --device cuda")
-    run = [f"experiment={experiment}", *SMALL, *SHORT[experiment], f"device={device}", "hydra.run.dir=run"]
+    run = [
+        f"experiment={experiment}",
+        *SMALL,
+        *SHORT[experiment],
+        f"device={device}",
+        "hydra.run.dir=run",
+    ]
     ended = outcome("run", *run)
     assert ended.code == 0, ended.err
     assert (folder / "run" / "report.html").is_file()

@@ -1,7 +1,8 @@
-"""Deflections of a pneumatic arm at rest, by hexahedra: quadratic ones do not lock, coarse linear ones do.
+"""Deflections of a pneumatic arm at rest, by hexahedra:
+quadratic ones do not lock, coarse linear ones do.
 
-The converged tip, extrapolated from 8-node hexahedra of 10 and 3.3 mm, is 31.63 mm aside under gravity with a base
-tilted by 20 degrees.
+The converged tip, extrapolated from 8-node hexahedra of 10 and 3.3 mm, is 31.63 mm aside under
+gravity with a base tilted by 20 degrees.
 """
 
 import math
@@ -11,7 +12,16 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, SolverSettings, quadratic
+from warp_resphys import (
+    Body,
+    Corotated,
+    Fibres,
+    Inputs,
+    Pressure,
+    Simulator,
+    SolverSettings,
+    quadratic,
+)
 from warp_resphys.mesh import find_chambers
 from warp_resphys.mesh.arm import mesh_arm
 from warp_resphys.settings.mesh import ArmMesh
@@ -22,11 +32,15 @@ CONVERGED = 31.63  # mm, under gravity
 
 @cache
 def deflection(size, layers, nodes, load, device):
-    """Way of the tip of an arm towards +x [mm], of gravity with a base tilted by 20 degrees, or of pressure."""
+    """Way of the tip of an arm towards +x [mm], of gravity
+    with a base tilted by 20 degrees, or of pressure.
+    """
     mesh = mesh_arm(ArmMesh(size=1e-3 * size, layers=1e-3 * layers))[0]
     mesh = mesh if nodes == 8 else quadratic(mesh, f"hexahedron{nodes}")
     heights, chambers = mesh.vertices[:, 2], find_chambers(mesh)
-    fixed, tip = (np.flatnonzero(np.abs(heights - end) < 1e-6) for end in (heights.max(), heights.min()))
+    fixed, tip = (
+        np.flatnonzero(np.abs(heights - end) < 1e-6) for end in (heights.max(), heights.min())
+    )
     pressed = Pressure(chambers)
     fibres = Fibres(chambers, (8.0, -8.0), 2e-3, stiffness=1e4)
     pressures = torch.zeros(1, len(chambers), dtype=torch.float64)
@@ -42,7 +56,8 @@ def deflection(size, layers, nodes, load, device):
     return 1e3 * float(moved[0, tip, 0].mean())
 
 
-MESHES = {  # sizes of elements and layers [mm], nodes of a cell, and ways of the tip: the table of docs/results
+# Sizes of elements and layers [mm], nodes of a cell, and ways of the tip: the table of docs/results
+MESHES = {
     "coarse linear hexahedra": (10.0, 24.0, 8, 29.10, -11.95),
     "linear hexahedra of the arm": (6.5, 10.0, 8, 30.80, -13.34),
     "20-node hexahedra": (10.0, 60.0, 20, 31.14, -13.06),
@@ -52,7 +67,10 @@ MESHES = {  # sizes of elements and layers [mm], nodes of a cell, and ways of th
 
 @pytest.mark.parametrize("name", MESHES)
 def test_an_arm_bends_as_far_as_its_elements_allow(name, device):
-    """The figures by which elements are recommended; quadratic ones are within 2 % under gravity."""
+    """The figures by which elements are recommended.
+
+    Quadratic ones are within 2 % under gravity.
+    """
     *mesh, gravity, pressure = MESHES[name]
     aside, bent = (deflection(*mesh, load, device) for load in ("gravity", "pressure"))
     assert aside == pytest.approx(gravity, rel=2e-3)
@@ -61,7 +79,11 @@ def test_an_arm_bends_as_far_as_its_elements_allow(name, device):
 
 
 def test_linear_hexahedra_converge_at_second_order(device):
-    """Richardson's extrapolation of the way of the tip from two meshes, one twice as fine, is the converged one."""
-    coarse, fine = (deflection(*sizes, 8, "gravity", device) for sizes in ((10.0, 24.0), (5.0, 12.0)))
+    """Richardson's extrapolation of the way of the tip from two meshes,
+    one twice as fine, is the converged one.
+    """
+    coarse, fine = (
+        deflection(*sizes, 8, "gravity", device) for sizes in ((10.0, 24.0), (5.0, 12.0))
+    )
     assert fine + (fine - coarse) / 3.0 == pytest.approx(CONVERGED, rel=5e-3)
     assert abs(fine - CONVERGED) < 0.35 * abs(coarse - CONVERGED)

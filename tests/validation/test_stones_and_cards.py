@@ -1,4 +1,5 @@
-"""An arch of stones and houses of cards stand with 5 % more friction than statics asks, and fall with 5 % less.
+"""An arch of stones and houses of cards stand with 5 % more friction than statics asks,
+and fall with 5 % less.
 
 A semicircular arch of rigid stones in equilibrium has joints that take no tension (Heyman 1966).
 
@@ -13,15 +14,25 @@ import pytest
 import torch
 
 from support.contact import G
-from warp_resphys import Body, Contact, HalfSpace, Rigid, Scene, Simulator, SurfaceContact, box_hexahedra
+from warp_resphys import (
+    Body,
+    Contact,
+    HalfSpace,
+    Rigid,
+    Scene,
+    Simulator,
+    SurfaceContact,
+    box_hexahedra,
+)
 
 DENSITY = 2000.0  # kg/m^3
 RADIUS, THICKNESS, STONE_WIDTH = 0.5, 0.12, 0.1  # of an arch [m]
 LENGTH, CARD, WIDTH = 0.2, 0.01, 0.1  # of a card [m]
 GAP = 2e-4  # at which contact of cards begins [m]
 REST = 0.97 * GAP  # between them at the start
-# Coefficients of friction below which no forces at the ends of joints carry the weights, by a linear program: of the
-# arch of 25 stones, and of two storeys of cards at 25 degrees, of which one storey needs 0.208.
+# Coefficients of friction below which no forces at the ends of joints carry the weights, by a
+# linear program: of the arch of 25 stones, and of two storeys of cards at 25 degrees, of which one
+# storey needs 0.208.
 ARCH, TWO_STOREYS = 0.307689, 0.297236
 
 
@@ -46,15 +57,18 @@ def arch(stones, friction):
         along = np.array([-math.sin(middle), 0.0, math.cos(middle)])
         x -= np.outer(x @ along, along) * gap / (angle * RADIUS)
         contact = Contact(floor, kappa, friction, distance)
-        bodies[f"stone{k}"] = Body.rigid_body(replace(brick, vertices=x), Rigid(density=DENSITY), energies=[contact])
+        bodies[f"stone{k}"] = Body.rigid_body(
+            replace(brick, vertices=x), Rigid(density=DENSITY), energies=[contact]
+        )
     return Scene(bodies, SurfaceContact(kappa, friction, distance))
 
 
 def house(degrees, storeys, friction):
-    """Storeys of pairs of rigid cards that lean on one another, with a flat card on every storey but the last.
+    """Storeys of pairs of rigid cards that lean on one another,
+    with a flat card on every storey but the last.
 
-    A leaning card, at an angle to the vertical [degrees], touches floor and neighbour with the edges of one of its
-    faces. Each storey has one pair fewer than that below.
+    A leaning card, at an angle to the vertical [degrees], touches floor and neighbour with the
+    edges of one of its faces. Each storey has one pair fewer than that below.
     """
     sine, cosine = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
     along, thick = LENGTH * np.array([sine, cosine]), CARD * np.array([-cosine, sine])
@@ -75,7 +89,9 @@ def house(degrees, storeys, friction):
     ground = Contact({"floor": HalfSpace(position=(0.0, 0.0, -REST))}, kappa, friction, GAP)
     for k, corners in enumerate(cards):
         u, y, v = brick.vertices.T
-        x, z = (corners[0] + np.outer(u, corners[1] - corners[0]) + np.outer(v, corners[3] - corners[0])).T
+        x, z = (
+            corners[0] + np.outer(u, corners[1] - corners[0]) + np.outer(v, corners[3] - corners[0])
+        ).T
         card = replace(brick, vertices=np.stack([x, y, z], 1))
         bodies[f"card{k}"] = Body.rigid_body(card, Rigid(density=DENSITY), energies=[ground])
     return Scene(bodies, SurfaceContact(kappa, friction, GAP))
@@ -90,16 +106,23 @@ def card_drop(scene, device):
 
 @pytest.mark.parametrize(("share", "stands"), [(1.05, True), (0.95, False)])
 def test_an_arch(share, stands, device):
-    """Of 25 stones: the speed of its keystone after half a second; every joint of one that stands creeps."""
+    """Of 25 stones: the speed of its keystone after half a second.
+
+    Every joint of one that stands creeps.
+    """
     stones = 25
     scene = arch(stones, share * ARCH)
-    speed = float(built(scene, device).v[-1, 0, scene.vertex_slice(f"stone{stones // 2}")].mean(0).norm())
+    speed = float(
+        built(scene, device).v[-1, 0, scene.vertex_slice(f"stone{stones // 2}")].mean(0).norm()
+    )
     assert speed < 5e-3 if stands else speed > 0.05
 
 
 @pytest.mark.parametrize("degrees", [15.0, 35.0])
 def test_two_cards(degrees, device):
-    """Moments about the edge on which a card stands, of its weight and of the other card's force, give the friction."""
+    """Moments about the edge on which a card stands,
+    of its weight and of the other card's force, give the friction.
+    """
     scene = house(degrees, 1, 0.3)
     x = scene.vertices[scene.vertex_slice("card0")]
     foot, top, middle = x[x[:, 2].argmin()], x[x[:, 0].argmax()], x.mean(0)
@@ -110,5 +133,7 @@ def test_two_cards(degrees, device):
 
 
 def test_a_second_storey_needs_more_friction(device):
-    stands, falls = (card_drop(house(25.0, 2, share * TWO_STOREYS), device) for share in (1.05, 0.95))
+    stands, falls = (
+        card_drop(house(25.0, 2, share * TWO_STOREYS), device) for share in (1.05, 0.95)
+    )
     assert stands < 1e-3 < 1e-2 < falls

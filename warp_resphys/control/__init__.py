@@ -1,1 +1,4 @@
-"""Control: inputs that make a point of a robot follow a path. Paths, reduced models, plans, estimators, baselines."""
+"""Control: inputs that make a point of a robot follow a path.
+
+Paths, reduced models, plans, estimators, baselines.
+"""

@@ -12,7 +12,14 @@ from ..data.input_network import InputNetwork
 from ..experiment.files import DRIVEN
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, InputError
-from ..io.safe_files import atomic_hdf5, create, read_array, read_checkpoint, read_hdf5, write_checkpoint
+from ..io.safe_files import (
+    atomic_hdf5,
+    create,
+    read_array,
+    read_checkpoint,
+    read_hdf5,
+    write_checkpoint,
+)
 from ..learning.residuals.correction import Learned
 from ..report.data import ReducedErrors
 from .linear_model import LinearModel
@@ -22,7 +29,8 @@ from .reduced_model import ReducedModel
 
 BASELINES: Final = "baselines.safetensors"
 _REDUCED: Final = "reduced model"
-_FORCE: Final = ("places", "seen", "conditions", "conditions_by", "usual", "push")  # of a learned force without network
+# Of a learned force without network.
+_FORCE: Final = ("places", "seen", "conditions", "conditions_by", "usual", "push")
 _KINDS: Final = {"damping": SquaredPolynomial, "branches": SquaredPolynomial}
 _BASELINES: Final = "baselines"
 _UNITS: Final = {"path": "m", "points": "m", "markers": "m", "errors_mm": "mm", "seconds": "s"}
@@ -54,7 +62,9 @@ def write_reduced(path: Path, model: ReducedModel) -> None:
     if (force := values.pop("force")) is not None:
         values |= {name: getattr(force, name) for name in _FORCE}
     acts = values["acts"].items()
-    values["acts"] = {word: value.plain() if isinstance(value, InputNetwork) else value for word, value in acts}
+    values["acts"] = {
+        word: value.plain() if isinstance(value, InputNetwork) else value for word, value in acts
+    }
     polynomials = {name: value for name, value in values.items() if isinstance(value, Polynomial)}
     arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
     plain = {name: value for name, value in values.items() if name not in {*polynomials, *arrays}}
@@ -72,22 +82,38 @@ def read_reduced(path: Path, learned: Learned | None) -> ReducedModel:
     """
     tensors, values = read_checkpoint(path, _REDUCED)
     try:
-        orders, arrays = values.pop("orders"), {name: tensor.numpy() for name, tensor in tensors.items()}
-        values |= arrays | {name: _KINDS.get(name, Polynomial)(arrays[name], order) for name, order in orders.items()}
-        arguments = {field.name: values[field.name] for field in fields(ReducedModel) if field.name != "force"}
+        orders = values.pop("orders")
+        arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
+        values |= arrays | {
+            name: _KINDS.get(name, Polynomial)(arrays[name], order)
+            for name, order in orders.items()
+        }
+        arguments = {
+            field.name: values[field.name]
+            for field in fields(ReducedModel)
+            if field.name != "force"
+        }
         arguments |= {key: tuple(arguments[key]) for key in ("labels", "filters", "times")}
         acts = arguments["acts"].items()
-        arguments["acts"] = {word: np.array(value) if isinstance(value, list) else value for word, value in acts}
+        arguments["acts"] = {
+            word: np.array(value) if isinstance(value, list) else value for word, value in acts
+        }
         if "network" in arguments["acts"]:
             arguments["acts"]["network"] = InputNetwork.of_plain(arguments["acts"]["network"])
         if "push" not in orders:
             return ReducedModel(**arguments)
         if learned is None:
-            raise InputError("the reduced model has a learned force: pass `robot.description.learned`.")
-        force = ReducedForce(learned.network, learned.range_, **{name: values[name] for name in _FORCE})
+            raise InputError(
+                "the reduced model has a learned force: pass `robot.description.learned`."
+            )
+        force = ReducedForce(
+            learned.network, learned.range_, **{name: values[name] for name in _FORCE}
+        )
         return ReducedModel(**arguments, force=force)
     except KeyError as error:
-        raise DataFileError(f"{path} is of an earlier version: delete it and run the same command again.") from error
+        raise DataFileError(
+            f"{path} is of an earlier version: delete it and run the same command again."
+        ) from error
 
 
 def read_quality(path: Path) -> ReducedErrors:
@@ -102,18 +128,21 @@ def write_motions(path: Path, kind: str, motions: Mapping[str, Arrays], **more: 
     Args:
         path: path of the file.
         kind: ``plans``, or ``driven`` by C controllers.
-        motions: arrays by name. Of every motion: ``path`` (T, d), reference of the point after each step [m]. Of plans:
-            ``inputs`` (T, n) during each step; ``points`` (T, d) and ``markers`` (T + 1, 3 M) predicted by the model
-            [m]; ``errors_mm``, mean distances of points and path, of the first plan and after each correction by the
-            robot. Of driven motions: ``points`` (C, T, d) measured [m], ``inputs`` (C, T, n), and ``seconds`` (C, T),
-            computing time of the commands.
+        motions: arrays by name. Of every motion: ``path`` (T, d), reference of the point after each
+            step [m]. Of plans: ``inputs`` (T, n) during each step; ``points`` (T, d) and
+            ``markers`` (T + 1, 3 M) predicted by the model [m]; ``errors_mm``, mean distances of
+            points and path, of the first plan and after each correction by the robot. Of driven
+            motions: ``points`` (C, T, d) measured [m], ``inputs`` (C, T, n), and ``seconds``
+            (C, T), computing time of the commands.
         more: attributes of the file.
     """
     with atomic_hdf5(path, kind, {"names": list(motions), **more}) as file:
         for name, motion in motions.items():
             group = file.create_group(name)
             for key, values in motion.items():
-                create(group, key, values, _UNITS.get(key, "1"), int(kind == PLAYED and key != "path"))
+                create(
+                    group, key, values, _UNITS.get(key, "1"), int(kind == PLAYED and key != "path")
+                )
 
 
 def read_motion(path: Path, kind: str, motion: str) -> dict[str, FloatArray]:

@@ -1,4 +1,6 @@
-"""Control stages: reduced models, plans, baselines without a simulator, and all controllers on the laboratory."""
+"""Control stages: reduced models, plans, baselines without a simulator,
+and all controllers on the laboratory.
+"""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -51,7 +53,8 @@ from .sampling import driven_input
 from .task import Task, motions_of
 from .worlds import Laboratory
 
-_RECEDING: Final = (1e-2, 1)  # weight of the inputs in plans with a receding horizon, and iterations
+# Weight of the inputs in plans with a receding horizon, and iterations.
+_RECEDING: Final = (1e-2, 1)
 _PRESSED: Final = 0.3  # share of the range by which inputs are changed to measure the Jacobian
 _ALL_SEEN: Final = 0.5  # share of a trial's frames that must show all markers, for the linear model
 
@@ -90,7 +93,14 @@ def plan_motions(context: StageContext) -> None:
     with Progress(context.name, total, "steps") as progress:
         for seconds in settings.control.seconds:
             paths = np.stack([path.timed(seconds, task.time_step, start) for path in task.paths])
-            followed = follow(robot, reduced, partial(task.planner, reduced), paths, plan.corrections, progress.advance)
+            followed = follow(
+                robot,
+                reduced,
+                partial(task.planner, reduced),
+                paths,
+                plan.corrections,
+                progress.advance,
+            )
             plans |= dict(zip(motions_of(settings.control, seconds), followed, strict=True))
     write_motions(context.run_dir / plans_file(model), PLANNED, plans)
     driven = driven_input(robot)
@@ -102,14 +112,17 @@ def plan_motions(context: StageContext) -> None:
 
 
 def fit_baselines(context: StageContext) -> None:
-    """Writes the linear model of the recordings, and the Jacobian of the laboratory, measured one input at a time.
+    """Writes the linear model of the recordings, and the Jacobian of the laboratory,
+    measured one input at a time.
 
     Raises:
         InputError: too few frames of the trials show all markers.
     """
     settings: StageSettings = context.settings
     robot = load(context.run_dir, settings.model, settings.device)
-    task, driven, data = Task(settings.control, robot), driven_input(robot), Trials.read(context.run_dir / DATASET)
+    task = Task(settings.control, robot)
+    driven = driven_input(robot)
+    data = Trials.read(context.run_dir / DATASET)
     assert driven.high is not None
     train, validation = (
         [_series(data, name, driven.name, robot.time_step) for name in names]
@@ -119,16 +132,23 @@ def fit_baselines(context: StageContext) -> None:
     feedback, limits = settings.control.feedback, settings.control.limits
     parts, steps = task.parts, max(round(feedback.settles / robot.time_step), 2)
     pressed = _PRESSED * limits.range * np.eye(parts)
-    laboratory = Laboratory(settings, context.run_dir, driven.name, parts, len(motions_of(settings.control)))
+    laboratory = Laboratory(
+        settings, context.run_dir, driven.name, parts, len(motions_of(settings.control))
+    )
     rest, pressing = laboratory.seen_at_rest(), repeat(limits.low + pressed, steps)
     with Progress(context.name, steps, "steps") as progress:
-        moving = rollout(laboratory.step, laboratory.rest, progress.each(pressing), lambda state: state)
-    last = [laboratory.seen(state, number) for number, state in enumerate(moving)][-max(steps // 5, 1) :]
+        moving = rollout(
+            laboratory.step, laboratory.rest, progress.each(pressing), lambda state: state
+        )
+    last = [laboratory.seen(state, number) for number, state in enumerate(moving)]
+    last = last[-max(steps // 5, 1) :]
     moved = (np.mean(last, axis=0) - rest).reshape(parts, -1) @ task.tracked.T  # (n, d)
     write_baselines(context.run_dir / BASELINES, linear, moved.T / np.diag(pressed))
 
 
-def _series(data: Trials, name: str, driven: str, time_step: float) -> tuple[FloatArray, FloatArray]:
+def _series(
+    data: Trials, name: str, driven: str, time_step: float
+) -> tuple[FloatArray, FloatArray]:
     """Resamples a trial at a robot's steps: markers (T + 1, 3 M) [m] and inputs (T, n)."""
     (row,) = data.rows([name])
     observed = data.observed if data.smoothed is None else data.smoothed
@@ -136,8 +156,8 @@ def _series(data: Trials, name: str, driven: str, time_step: float) -> tuple[Flo
     whole = np.isfinite(seen).all(1)
     if whole.mean() < _ALL_SEEN:
         raise InputError(
-            f"trial {name} shows all markers in {100 * whole.mean():.0f} % of its frames: the linear model of control "
-            f"needs {100 * _ALL_SEEN:.0f} %."
+            f"trial {name} shows all markers in {100 * whole.mean():.0f} % of its frames: the "
+            f"linear model of control needs {100 * _ALL_SEEN:.0f} %."
         )
     steps = round(float(times[whole].max()) / time_step)
     at = time_step * np.arange(steps + 1)
@@ -148,7 +168,9 @@ def _series(data: Trials, name: str, driven: str, time_step: float) -> tuple[Flo
 
 
 def drive(context: StageContext, workers: Workers = ALONE) -> None:
-    """Drives all motions on the simulated laboratory with all controllers, and writes the result."""
+    """Drives all motions on the simulated laboratory with all controllers,
+    and writes the result.
+    """
     settings: StageSettings = context.settings
     control = settings.control
     controllers = controllers_of(control)
@@ -157,7 +179,14 @@ def drive(context: StageContext, workers: Workers = ALONE) -> None:
     for seconds in control.seconds:
         for name in motions_of(control, seconds):
             steps = task.steps(seconds)
-            cut_up.append(TrialPart(name, (name,), steps + 1, partial(_driven, settings, context.run_dir, name, steps)))
+            cut_up.append(
+                TrialPart(
+                    name,
+                    (name,),
+                    steps + 1,
+                    partial(_driven, settings, context.run_dir, name, steps),
+                )
+            )
     parts = Parts.of(context, workers)
     parts.run(cut_up)
     motions = {}
@@ -183,17 +212,23 @@ def controllers_of(control: ControlSettings) -> list[str]:
 
 
 def _driven(settings: StageSettings, folder: Path, name: str, steps: int, report: Report) -> Arrays:
-    """One motion with all controllers, each on a body of its own: points, inputs and computing times."""
+    """One motion with all controllers, each on a body of its own:
+    points, inputs and computing times.
+    """
     control = settings.control
     robot = load(folder, control.models[-1], settings.device)
     task, driven, count = Task(control, robot), driven_input(robot), len(controllers_of(control))
     laboratory = Laboratory(settings, folder, driven.name, count, motions_of(control).index(name))
-    plans = {model: read_motion(folder / plans_file(model), PLANNED, name) for model in control.models}
+    plans = {
+        model: read_motion(folder / plans_file(model), PLANNED, name) for model in control.models
+    }
     rest, path = laboratory.seen_at_rest(), plans[control.models[-1]]["path"]
     linear, jacobian = read_baselines(folder / BASELINES)
     controllers = list[Controller]()
     for model in control.receding:
-        learned = robot if model == robot.description.model else load(folder, model, settings.device)
+        learned = (
+            robot if model == robot.description.model else load(folder, model, settings.device)
+        )
         reduced = read_reduced(folder / reduced_file(model), learned.description.learned)
         planner = task.planner(reduced, path, control.horizon, *_RECEDING)
         controllers.append(RecedingHorizon(planner, reduced, rest[len(plans) + len(controllers)]))
@@ -201,7 +236,11 @@ def _driven(settings: StageSettings, folder: Path, name: str, steps: int, report
     controllers.append(LinearRecedingHorizon(planner, linear, rest[len(plans) + len(controllers)]))
     for gain in control.feedback.gains:
         start = rest[len(plans) + len(controllers)]
-        controllers.append(JacobianFeedback(jacobian, control.limits, gain, task.time_step, task.tracked, path, start))
+        controllers.append(
+            JacobianFeedback(
+                jacobian, control.limits, gain, task.time_step, task.tracked, path, start
+            )
+        )
     inputs, seconds = list[FloatArray](), list[FloatArray]()
 
     def step(state: State, number: int) -> State:
@@ -226,31 +265,49 @@ def _driven(settings: StageSettings, folder: Path, name: str, steps: int, report
 
 
 def _summary(
-    folder: Path, control: ControlSettings, controllers: Sequence[str], motions: Mapping[str, MotionArrays]
+    folder: Path,
+    control: ControlSettings,
+    controllers: Sequence[str],
+    motions: Mapping[str, MotionArrays],
 ) -> ControlResults:
-    """Content of control.json: errors [mm] by speed and controller, computing times, quality of the reduced models."""
+    """Content of control.json: errors [mm] by speed and controller,
+    computing times, quality of the reduced models.
+    """
     by_speed: dict[str, dict[str, TrackingErrors]] = {}
     for seconds in control.seconds:
         names = motions_of(control, seconds)
-        errors = {name: 1e3 * np.linalg.norm(motions[name]["points"] - motions[name]["path"], axis=2) for name in names}
+        errors = {
+            name: 1e3 * np.linalg.norm(motions[name]["points"] - motions[name]["path"], axis=2)
+            for name in names
+        }
         by_speed[f"{seconds:g}"] = {
             controller: {
                 "mean_mm": float(np.mean([of_motion[row].mean() for of_motion in errors.values()])),
                 "max_mm": float(max(of_motion[row].max() for of_motion in errors.values())),
-                "motions_mm": {name: float(of_motion[row].mean()) for name, of_motion in errors.items()},
+                "motions_mm": {
+                    name: float(of_motion[row].mean()) for name, of_motion in errors.items()
+                },
             }
             for row, controller in enumerate(controllers)
         }
     times = np.concatenate([motion["seconds"] for motion in motions.values()], axis=1)
     planned: dict[str, dict[str, list[float]]] = {
-        model: {name: read_motion(folder / plans_file(model), PLANNED, name)["errors_mm"].tolist() for name in motions}
+        model: {
+            name: read_motion(folder / plans_file(model), PLANNED, name)["errors_mm"].tolist()
+            for name in motions
+        }
         for model in control.models
     }
-    models: dict[str, ReducedErrors] = {model: read_quality(folder / reduced_file(model)) for model in control.models}
+    models: dict[str, ReducedErrors] = {
+        model: read_quality(folder / reduced_file(model)) for model in control.models
+    }
     return {
         "tracking": by_speed,
         "command_ms": {
-            name: {"median": 1e3 * float(np.median(row)), "largest_of_20": 1e3 * float(np.quantile(row, 0.95))}
+            name: {
+                "median": 1e3 * float(np.median(row)),
+                "largest_of_20": 1e3 * float(np.quantile(row, 0.95)),
+            }
             for name, row in zip(controllers, times, strict=True)
         },
         "planned_mm": planned,
@@ -268,12 +325,15 @@ def driven_settings(folder: Path) -> StageSettings:
     """
     if (folder / "stages").is_dir() and not (folder / DRIVEN).is_file():
         raise InputError(
-            f"no motion was driven in {folder}: name a finished run of an experiment with control, as sopra_control."
+            f"no motion was driven in {folder}: name a finished run of an experiment with "
+            "control, as sopra_control."
         )
     return parse(StageSettings, finished_record(folder, "drive")["settings"])
 
 
-def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float = np.inf) -> DrivenBodies:
+def replay(
+    folder: Path, motion: str, controllers: Sequence[str], seconds: float = np.inf
+) -> DrivenBodies:
     """Drives the laboratory with the recorded inputs of a motion.
 
     Args:
@@ -293,13 +353,16 @@ def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float
     check_chosen("motion", [motion], motions_of(control))
     check_chosen("controllers", controllers, names)
     robot = load(folder, control.models[-1], settings.device)
-    driven, rows = read_motion(folder / DRIVEN, PLAYED, motion), [names.index(name) for name in controllers]
+    driven = read_motion(folder / DRIVEN, PLAYED, motion)
+    rows = [names.index(name) for name in controllers]
     steps = max(int(min(len(driven["path"]), seconds / robot.time_step)), 1)
     laboratory = Laboratory(settings, folder, driven_input(robot).name, len(rows), 0)
     tracked = tracked_of(robot.labels, control.tracked)
     acting = driven["inputs"][rows, :steps].swapaxes(0, 1)
     with Progress("laboratory", steps, "steps") as progress:
-        moved = rollout(laboratory.step, laboratory.rest, progress.each(acting), lambda state: state)
+        moved = rollout(
+            laboratory.step, laboratory.rest, progress.each(acting), lambda state: state
+        )
     bodies = np.stack([laboratory.bodies(state)[1] for state in moved], 1)
     markers = np.stack([laboratory.markers(state) for state in moved], 1)  # (C, T + 1, M, 3)
     return DrivenBodies(

@@ -1,9 +1,10 @@
-"""Controllers: receding horizon (a new plan at every step), with the state from markers, and Jacobian feedback.
+"""Controllers: receding horizon (a new plan at every step),
+with the state from markers, and Jacobian feedback.
 
-The state is estimated by an extended Kalman filter on a reduced model. It is (z, z', b): coordinates, their rates, and
-the offset b of the real robot's equilibria from the model's, a random walk. Estimating b removes the steady-state error
-of a receding horizon, whatever constant error the model has (offset-free control: Pannocchia and Rawlings, AIChE J. 49
-(2003) 426).
+The state is estimated by an extended Kalman filter on a reduced model. It is (z, z', b):
+coordinates, their rates, and the offset b of the real robot's equilibria from the model's, a random
+walk. Estimating b removes the steady-state error of a receding horizon, whatever constant error the
+model has (offset-free control: Pannocchia and Rawlings, AIChE J. 49 (2003) 426).
 """
 
 from collections.abc import Callable
@@ -21,11 +22,14 @@ from .reduced_model import ReducedModel
 _SETTLES = 0.1  # gain per step of the disturbance observer of the linear model
 _AVERAGED = 0.25  # window of the means of points and inputs, which averages vibrations out [s]
 _LEARNING = 0.05  # share of Broyden's correction taken per step
-_LITTLE = 1e-3  # regularises Broyden's correction: squared change of the inputs, as shares of their ranges
+# Regularises Broyden's correction: squared change of the inputs, as shares of their ranges.
+_LITTLE = 1e-3
 _DAMPING = 0.05  # of the inverse of the Jacobian, relative to its largest singular value
 
-Controller = Callable[[int, FloatArray], FloatArray]  # inputs (n,) of a step, from markers (M, 3) before it [m]
-_RATE = 0.3  # unmodelled change of the rates in a step, relative to their spread in a swing of one millimetre
+# Inputs (n,) of a step, from markers (M, 3) before it [m].
+Controller = Callable[[int, FloatArray], FloatArray]
+# Unmodelled change of the rates in a step, relative to their spread in a swing of one millimetre.
+_RATE = 0.3
 _BIAS = 5e-3  # drift of the bias in a second, as a displacement of the markers [m]
 _JITTER = 1e-12  # of a correlation matrix, which is singular where a quantity is known exactly
 
@@ -41,7 +45,11 @@ class Estimator:
     """
 
     def __init__(
-        self, model: ReducedModel, inputs: FloatArray, offset: FloatArray | None = None, noise: float = 1e-4
+        self,
+        model: ReducedModel,
+        inputs: FloatArray,
+        offset: FloatArray | None = None,
+        noise: float = 1e-4,
     ) -> None:
         self.model, self._noise = model, noise
         self.state = model.rest(inputs)
@@ -55,18 +63,29 @@ class Estimator:
         one = 1e-3 / size
         stiffness = np.abs(np.diag(model.stiffness(u)[0]))
         self._wander = np.concatenate(
-            [np.zeros(r), (_RATE * one * np.sqrt(stiffness)) ** 2, (_BIAS / size) ** 2 * model.time_step]
+            [
+                np.zeros(r),
+                (_RATE * one * np.sqrt(stiffness)) ** 2,
+                (_BIAS / size) ** 2 * model.time_step,
+            ]
         )
-        self._covariance = np.diag(np.concatenate([one**2, (one * np.sqrt(stiffness)) ** 2, (2.0 * one) ** 2]))
+        self._covariance = np.diag(
+            np.concatenate([one**2, (one * np.sqrt(stiffness)) ** 2, (2.0 * one) ** 2])
+        )
 
     def predict(self, inputs: FloatArray) -> None:
         """Advances the estimate by one step under inputs (n,)."""
         transition = np.eye(3 * self.model.modes)
-        self.state, transition[: 2 * self.model.modes] = self.model.transition(self.state, inputs, self.bias[None])
+        self.state, transition[: 2 * self.model.modes] = self.model.transition(
+            self.state, inputs, self.bias[None]
+        )
         self._covariance = transition @ self._covariance @ transition.T + np.diag(self._wander)
 
     def correct(self, markers: FloatArray) -> None:
-        """Updates the estimate with markers (M, 3) observed after the step [m]; NaN where one is not seen."""
+        """Updates the estimate with markers (M, 3) observed after the step [m].
+
+        NaN where one is not seen.
+        """
         model, r = self.model, self.model.modes
         seen = np.isfinite(markers).ravel()
         if not seen.any():
@@ -85,7 +104,8 @@ def conditioned(
 ) -> tuple[FloatArray, FloatArray]:
     """Conditions n jointly normal errors on m observations with independent noise.
 
-    In the square-root form of Bierman (1977), which stays positive definite, and costs n^3 however many observations.
+    In the square-root form of Bierman (1977), which stays positive definite, and costs n^3 however
+    many observations.
 
     Args:
         covariance: (n, n).
@@ -118,21 +138,29 @@ class RecedingHorizon:
     def __init__(self, planner: Planner, model: ReducedModel, rest: FloatArray) -> None:
         offset = rest.ravel() - model.observe(model.rest())[0]
         self._planner = planner
-        self._estimator = Estimator(model, np.zeros(model.parts), np.where(np.isfinite(offset), offset, 0.0))
+        self._estimator = Estimator(
+            model, np.zeros(model.parts), np.where(np.isfinite(offset), offset, 0.0)
+        )
         self._offset = planner.tracked @ self._estimator.offset
 
     def __call__(self, number: int, markers: FloatArray) -> FloatArray:
-        """Returns the inputs (n,) of a step, from markers (M, 3) before it [m], NaN where one is not seen."""
+        """Returns the inputs (n,) of a step, from markers (M, 3) before it [m],
+        NaN where one is not seen.
+        """
         estimate = self._estimator
         if number:
             estimate.correct(markers)
-        command: FloatArray = self._planner.plan(number, estimate.state, estimate.bias, self._offset)[0]
+        command: FloatArray = self._planner.plan(
+            number, estimate.state, estimate.bias, self._offset
+        )[0]
         estimate.predict(command)
         return command
 
 
 class LinearRecedingHorizon:
-    """Plans with a linear model, from the last markers; a disturbance observer removes its constant error.
+    """Plans with a linear model, from the last markers.
+
+    A disturbance observer removes its constant error.
 
     Args:
         planner: along the path, on the model.
@@ -142,24 +170,31 @@ class LinearRecedingHorizon:
 
     def __init__(self, planner: Planner, model: LinearModel, rest: FloatArray) -> None:
         self._planner, self._model = planner, model
-        self.seen = np.tile(np.where(np.isfinite(rest), rest, model.rest.reshape(-1, 3)).ravel(), (DELAYS, 1))
+        self.seen = np.tile(
+            np.where(np.isfinite(rest), rest, model.rest.reshape(-1, 3)).ravel(), (DELAYS, 1)
+        )
         self.expected = self.seen[0]
         self.missed = np.zeros_like(self.expected)
 
     def __call__(self, number: int, markers: FloatArray) -> FloatArray:
-        """Returns the inputs (n,) of a step, from markers (M, 3) before it [m], NaN where one is not seen."""
+        """Returns the inputs (n,) of a step, from markers (M, 3) before it [m],
+        NaN where one is not seen.
+        """
         if number:
             now = np.where(np.isfinite(markers.ravel()), markers.ravel(), self.expected)
             self.missed = self.missed + _SETTLES * (now - self.expected - self.missed)
             self.seen = np.concatenate([now[None], self.seen[:-1]])
         state = self._model.state(list(self.seen))
-        command: FloatArray = self._planner.plan(number, state, offset=self._planner.tracked @ self.missed)[0]
+        command: FloatArray = self._planner.plan(
+            number, state, offset=self._planner.tracked @ self.missed
+        )[0]
         self.expected = self._model.respond(state, command[None, None])[0, 0]
         return command
 
 
 class JacobianFeedback:
-    """Feeds the error back through a measured Jacobian, which Broyden's rule updates while the robot moves.
+    """Feeds the error back through a measured Jacobian,
+    which Broyden's rule updates while the robot moves.
 
     The rule is applied to means over a time window, because the body vibrates.
 
@@ -183,7 +218,12 @@ class JacobianFeedback:
         path: FloatArray,
         rest: FloatArray,
     ) -> None:
-        self.jacobian, self._limits, self._gain, self._step = jacobian * limits.range, limits, gain, time_step
+        self.jacobian, self._limits, self._gain, self._step = (
+            jacobian * limits.range,
+            limits,
+            gain,
+            time_step,
+        )
         self._tracked, self._path, self.last_seen = tracked, path, rest.ravel()
         self.shares = np.zeros(jacobian.shape[1])
         self._damping = _DAMPING * float(np.linalg.norm(self.jacobian, 2))
@@ -191,21 +231,28 @@ class JacobianFeedback:
         self.past = np.zeros((0, sum(jacobian.shape)))  # points and inputs as shares, latest last
 
     def __call__(self, number: int, markers: FloatArray) -> FloatArray:
-        """Returns the inputs (n,) of a step, from markers (M, 3) before it [m], NaN where one is not seen."""
+        """Returns the inputs (n,) of a step, from markers (M, 3) before it [m],
+        NaN where one is not seen.
+        """
         self.last_seen = np.where(np.isfinite(markers.ravel()), markers.ravel(), self.last_seen)
-        point, goal, next_goal = self._tracked @ self.last_seen, self._path[max(number - 1, 0)], self._path[number]
+        point = self._tracked @ self.last_seen
+        goal = self._path[max(number - 1, 0)]
+        next_goal = self._path[number]
         u, h, d = self.shares, self._step, len(point)
         self.past = np.concatenate([self.past, [np.concatenate([point, u])]])[-2 * self._window :]
         if len(self.past) == 2 * self._window:
             before, now = (window.mean(0) for window in np.split(self.past, 2))
             moved, changed = (now - before)[:d], (now - before)[d:]
             missed = moved - self.jacobian @ changed
-            self.jacobian = self.jacobian + _LEARNING / (changed @ changed + _LITTLE) * np.outer(missed, changed)
+            self.jacobian = self.jacobian + _LEARNING / (changed @ changed + _LITTLE) * np.outer(
+                missed, changed
+            )
         wanted = next_goal - goal + self._gain * h * (goal - point)
         j = self.jacobian
         inverse = j.T @ np.linalg.inv(j @ j.T + self._damping**2 * np.eye(d))
         change = inverse @ wanted
-        # In the null space of the Jacobian, the inputs move towards their mean, away from their bounds.
+        # In the null space of the Jacobian, the inputs move towards their mean, away from their
+        # bounds.
         change = change - 0.5 * h * (np.eye(len(u)) - inverse @ j) @ (u - u.mean())
         most = self._limits.rate * h / self._limits.range
         self.shares = np.clip(u + np.clip(change, -most, most), 0.0, 1.0)

@@ -1,7 +1,9 @@
-"""A linear model fitted to recordings, without a simulator; plans can use it in place of a reduced model.
+"""A linear model fitted to recordings, without a simulator.
 
-It is a dynamic mode decomposition with control (Proctor, Brunton and Kutz, SIAM J. Appl. Dyn. Syst. 15 (2016) 142) of
-delayed marker positions.
+Plans can use it in place of a reduced model.
+
+It is a dynamic mode decomposition with control (Proctor, Brunton and Kutz, SIAM J. Appl. Dyn. Syst.
+15 (2016) 142) of delayed marker positions.
 """
 
 from collections.abc import Sequence
@@ -20,7 +22,9 @@ _AHEAD = 0.3  # prediction horizon of the validation [s]
 
 @dataclass(frozen=True)
 class LinearModel:
-    """s' = A s + B u, y = y_0 + C s, with a state s of delayed markers and inputs u in units of `scale`."""
+    """s' = A s + B u, y = y_0 + C s, with a state s of delayed markers
+    and inputs u in units of `scale`.
+    """
 
     time_step: float  # h [s]
     scale: FloatArray  # (n,) of the inputs
@@ -40,8 +44,13 @@ class LinearModel:
         """State (q,) of the last D frames of markers (3 M,), latest first [m]."""
         return np.asarray((np.concatenate(markers) - np.tile(self.rest, len(markers))) @ self.basis)
 
-    def respond(self, start: FloatArray, inputs: FloatArray, bias: FloatArray | None = None) -> FloatArray:
-        """Predicts the markers (T, B, 3 M) of B motions [m], as `ReducedModel.respond`; ``bias`` has no effect."""
+    def respond(
+        self, start: FloatArray, inputs: FloatArray, bias: FloatArray | None = None
+    ) -> FloatArray:
+        """Predicts the markers (T, B, 3 M) of B motions [m], as `ReducedModel.respond`.
+
+        ``bias`` has no effect.
+        """
         s, states = start, []
         for u in inputs / self.scale:
             s = s @ self.a.T + u @ self.b.T
@@ -55,7 +64,9 @@ def fit_linear(
     scale: FloatArray,
     time_step: float,
 ) -> LinearModel:
-    """Fits a linear model to recordings; its rank is the one with the least error on the validation trials.
+    """Fits a linear model to recordings.
+
+    Its rank is the one with the least error on the validation trials.
 
     Args:
         train: for each trial, markers (T + 1, 3 M) [m] that begin at rest, and inputs (T, n).
@@ -70,7 +81,9 @@ def fit_linear(
         off = markers - rest
         return np.concatenate([off[DELAYS - 1 - j : len(off) - j] for j in range(DELAYS)], axis=1)
 
-    def pairs(trials: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def pairs(
+        trials: Sequence[tuple[FloatArray, FloatArray]],
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         rows = [(delayed(y), u[DELAYS - 1 :] / scale) for y, u in trials]
         return (
             np.concatenate([x[:-1][: len(u)] for x, u in rows]),
@@ -87,7 +100,9 @@ def fit_linear(
         normal = features.T @ features
         normal += _RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
         a, b = np.split(np.linalg.solve(normal, features.T @ (after @ basis)).T, [rank], axis=1)
-        model = LinearModel(time_step, scale, rest, basis, a, b, basis[: len(rest)], validation_mm=np.inf)
+        model = LinearModel(
+            time_step, scale, rest, basis, a, b, basis[: len(rest)], validation_mm=np.inf
+        )
         candidates.append(replace(model, validation_mm=_prediction_error(model, validation)))
     return min(candidates, key=lambda model: model.validation_mm)
 

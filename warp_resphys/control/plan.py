@@ -1,13 +1,15 @@
-"""Plans: inputs that make points follow a path, by Gauss-Newton on a prediction model, within bounds and rate limits.
+"""Plans: inputs that make points follow a path, by Gauss-Newton on a prediction model,
+within bounds and rate limits.
 
-The inputs of a plan are piecewise linear between knots. Each iteration solves a quadratic program for the change of
-the knots: it minimises the distance of the points from the path, plus small penalties on the inputs and their changes.
-Derivatives are differences of motions that are predicted at once. The best of the whole change, its half, quarter and
-eighth is taken, as inputs need not follow their commands linearly, as with a learned actuator or a slow valve.
+The inputs of a plan are piecewise linear between knots. Each iteration solves a quadratic program
+for the change of the knots: it minimises the distance of the points from the path, plus small
+penalties on the inputs and their changes. Derivatives are differences of motions that are predicted
+at once. The best of the whole change, its half, quarter and eighth is taken, as inputs need not
+follow their commands linearly, as with a learned actuator or a slow valve.
 
-A reduced model plans whole motions by a receding horizon in which it is the robot itself. The robot's simulator plays
-the plan, and the difference of its point from the model's is added to the model's in the next plan (iterative learning
-control).
+A reduced model plans whole motions by a receding horizon in which it is the robot itself. The
+robot's simulator plays the plan, and the difference of its point from the model's is added to the
+model's in the next plan (iterative learning control).
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +28,9 @@ from .reduced_model import ReducedModel
 from .sampling import OnProgress
 
 _TOLERANCE: Final = 1e-5  # of a quadratic program
-_ENOUGH: Final = 1e-3  # change of a plan, as a share of the inputs' ranges, below which the iterations stop
+_ENOUGH: Final = (
+    1e-3  # change of a plan, as a share of the inputs' ranges, below which the iterations stop
+)
 _DIFFERENCE: Final = 1e-3  # of knots for derivatives, as a share of the inputs' ranges
 _SHARES: Final = 0.5 ** np.arange(4.0)  # of a change of the knots, of which the best is taken
 _SHORTER: Final = 0.25  # factor on a correction that made the motion worse
@@ -43,8 +47,8 @@ class Planner:
         path: (T, d) reference of the points after each step [m], NaN where they are free.
         steps: H, of the horizon; past the end of the path, its last point is repeated.
         pieces: of the piecewise linear inputs, from 1 to H.
-        weight: of the mean squares of the inputs, as shares of their ranges, and of their changes between knots, as
-            shares of the rate limits, beside squared distances in millimetres.
+        weight: of the mean squares of the inputs, as shares of their ranges, and of their changes
+            between knots, as shares of the rate limits, beside squared distances in millimetres.
         iterations: of Gauss-Newton, at most.
     """
 
@@ -70,7 +74,12 @@ class Planner:
         self._knots = np.full((pieces + 1, model.parts), limits.low)
 
     def plan(
-        self, number: int, start: Any, bias: FloatArray | None = None, offset: FloatArray | None = None, played: int = 1
+        self,
+        number: int,
+        start: Any,
+        bias: FloatArray | None = None,
+        offset: FloatArray | None = None,
+        played: int = 1,
     ) -> FloatArray:
         """Returns the inputs (H, n) from a step on.
 
@@ -93,7 +102,9 @@ class Planner:
         def knots_of(shares: FloatArray) -> FloatArray:
             """Knots (B, K, n) of B plans, the first of which is known."""
             knots = limits.low + limits.range * shares.reshape(len(shares), -1, len(first))
-            return np.concatenate([np.broadcast_to(first, (len(knots), 1, len(first))), knots], axis=1)
+            return np.concatenate(
+                [np.broadcast_to(first, (len(knots), 1, len(first))), knots], axis=1
+            )
 
         def points_of(shares: FloatArray) -> FloatArray:
             """Points (H, B, d) of B plans [m]."""
@@ -111,9 +122,12 @@ class Planner:
                 break
         (knots,) = knots_of(shares[None])
         inputs = self._lines @ knots
-        series, at = np.concatenate([knots[:1], inputs]), np.arange(len(knots)) / (len(knots) - 1) * self.steps
+        series = np.concatenate([knots[:1], inputs])
+        at = np.arange(len(knots)) / (len(knots) - 1) * self.steps
         later = np.minimum(at + played, self.steps)
-        self._knots = np.stack([np.interp(later, np.arange(self.steps + 1), column) for column in series.T], axis=1)
+        self._knots = np.stack(
+            [np.interp(later, np.arange(self.steps + 1), column) for column in series.T], axis=1
+        )
         return np.asarray(inputs)
 
     def _step(self, slopes: FloatArray, errors: FloatArray, shares: FloatArray) -> FloatArray:
@@ -130,10 +144,15 @@ class Planner:
     def _changes(self, shares: FloatArray) -> FloatArray:
         """Changes (..., P) between knots, as shares of the rate limits."""
         first = (self._knots[0] - self.limits.low) / self.limits.range
-        return np.asarray(shares @ self._jumps.T - np.pad(first, (0, shares.shape[-1] - len(first))) / self._most)
+        return np.asarray(
+            shares @ self._jumps.T - np.pad(first, (0, shares.shape[-1] - len(first))) / self._most
+        )
 
     def _costs(self, points: FloatArray, goal: FloatArray, shares: FloatArray) -> FloatArray:
-        """Costs (B,) of plans (B, P) with points (H, B, d) [m] and goals (H, d); infinite where the model diverges."""
+        """Costs (B,) of plans (B, P) with points (H, B, d) [m] and goals (H, d).
+
+        Infinite where the model diverges.
+        """
         errors = np.where(np.isfinite(goal)[:, None], points - goal[:, None], 0.0)
         size = (shares**2).mean(1) + (self._changes(shares) ** 2).mean(1)
         costs = 1e6 * (errors**2).sum((0, 2)) + self._weight * goal.size * size
@@ -161,7 +180,8 @@ def solve_program(
     solver.setup(hessian, gradient, None, None, rows, least, most, low, high)
     if solver.solve() != piqp.PIQP_SOLVED:
         raise InputError(
-            "no inputs satisfy their bounds and rate limits: raise the rate limits, or begin within the bounds."
+            "no inputs satisfy their bounds and rate limits: raise the rate limits, or begin "
+            "within the bounds."
         )
     return np.asarray(solver.result.x)
 
@@ -181,7 +201,9 @@ def check_chosen(key: str, chosen: Sequence[str], known: Sequence[str]) -> None:
     """Raises an `InputError` about a setting unless it has names, all of which are known."""
     unknown = [name for name in chosen if name not in known]
     if unknown or not chosen:
-        raise InputError(f"{key} names {unknown[0] if unknown else 'none'}: choose from {', '.join(known)}.")
+        raise InputError(
+            f"{key} names {unknown[0] if unknown else 'none'}: choose from {', '.join(known)}."
+        )
 
 
 def follow(
@@ -206,10 +228,19 @@ def follow(
         InputError: no inputs satisfy their bounds.
         ConvergenceError: the robot's simulation fails.
     """
-    tracked, low = planner_of(paths[0]).tracked, np.full(model.parts, planner_of(paths[0]).limits.low)
+    tracked = planner_of(paths[0]).tracked
+    low = np.full(model.parts, planner_of(paths[0]).limits.low)
     start, offsets = model.rest(low), np.zeros_like(paths)
-    wanted = np.stack([_planned(model, planner_of(path), offset) for path, offset in zip(paths, offsets, strict=True)])
-    inputs, kept, errors, best = wanted, wanted.copy(), list[FloatArray](), np.full(len(paths), np.inf)
+    wanted = np.stack(
+        [
+            _planned(model, planner_of(path), offset)
+            for path, offset in zip(paths, offsets, strict=True)
+        ]
+    )
+    inputs = wanted
+    kept = wanted.copy()
+    errors = list[FloatArray]()
+    best = np.full(len(paths), np.inf)
     kept_markers, shares = list[FloatArray](paths), np.ones(len(paths))
     for _ in range(corrections + 1):
         markers = _played(robot, model.name, low, inputs, on_progress)
@@ -217,7 +248,12 @@ def follow(
         errors.append(1e3 * np.linalg.norm(points - paths, axis=2).mean(1))
         for row, error in enumerate(errors[-1]):
             if error < best[row]:
-                best[row], kept[row], kept_markers[row], shares[row] = error, inputs[row], markers[row], 1.0
+                best[row], kept[row], kept_markers[row], shares[row] = (
+                    error,
+                    inputs[row],
+                    markers[row],
+                    1.0,
+                )
                 offset = points[row] - model.respond(start, inputs[row][:, None])[:, 0] @ tracked.T
                 wanted[row] = _planned(model, planner_of(paths[row]), offset)
             else:
@@ -225,26 +261,38 @@ def follow(
         inputs = kept + shares[:, None, None] * (wanted - kept)
     rows = zip(paths, kept, kept_markers, np.array(errors).T, strict=True)
     return [
-        {"path": path, "inputs": commands, "points": markers[1:] @ tracked.T, "markers": markers, "errors_mm": mm}
+        {
+            "path": path,
+            "inputs": commands,
+            "points": markers[1:] @ tracked.T,
+            "markers": markers,
+            "errors_mm": mm,
+        }
         for path, commands, markers, mm in rows
     ]
 
 
 def _planned(model: ReducedModel, planner: Planner, offset: FloatArray) -> FloatArray:
-    """Inputs (T, n) for a whole path, whose points are off from those of the model by (T, d) [m]."""
+    """Inputs (T, n) for a whole path, whose points are off
+    from those of the model by (T, d) [m].
+    """
     state, inputs = model.rest(np.full(model.parts, planner.limits.low)), list[FloatArray]()
     steps = max(planner.steps // _PLAYED, 1)
     for number in range(0, len(planner.path), steps):
-        now = planner.plan(number, state, offset=offset, played=steps)[: min(steps, len(planner.path) - number)]
+        now = planner.plan(number, state, offset=offset, played=steps)
+        now = now[: min(steps, len(planner.path) - number)]
         state = model.move(state, now[:, None])[2]
         inputs.append(now)
     return np.concatenate(inputs)
 
 
 @torch.no_grad()
-def _played(robot: Robot, name: str, low: FloatArray, inputs: FloatArray, on_progress: OnProgress) -> FloatArray:
+def _played(
+    robot: Robot, name: str, low: FloatArray, inputs: FloatArray, on_progress: OnProgress
+) -> FloatArray:
     """Markers (B, T + 1, 3 M) of the robot under inputs (B, T, n) [m]."""
-    start, commands = robot.begin(len(inputs), **{name: low}), robot.simulator.tensor(inputs.swapaxes(0, 1))
+    start = robot.begin(len(inputs), **{name: low})
+    commands = robot.simulator.tensor(inputs.swapaxes(0, 1))
     series: dict[str, Any] = {name: commands}
     motion = robot.rollout(start, on_step=lambda number: on_progress(1), **series)
     return np.asarray(motion.markers.flatten(2).swapaxes(0, 1).double().cpu().numpy())

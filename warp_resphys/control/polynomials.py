@@ -27,7 +27,9 @@ class Monomials:
         while self._order < order:
             self._order += 1
             factors, before = _products(variables, self._order)
-            self._values = np.concatenate([self._values, self.points[:, factors] * self._values[:, before]], axis=1)
+            self._values = np.concatenate(
+                [self._values, self.points[:, factors] * self._values[:, before]], axis=1
+            )
         return self._values[:, : len(powers(variables, order))]
 
 
@@ -46,7 +48,10 @@ class Polynomial:
 
     @classmethod
     def fitted(cls, points: FloatArray, values: FloatArray, order: int) -> "Polynomial":
-        """Fits values (S, *shape) at points (S, n) by least squares; the order is lowered where samples are too few."""
+        """Fits values (S, *shape) at points (S, n) by least squares.
+
+        The order is lowered where samples are too few.
+        """
         variables = points.shape[1]
         while order > 0 and len(powers(variables, order)) > _SHARE_OF_POINTS * len(points):
             order -= 1
@@ -56,11 +61,14 @@ class Polynomial:
     def __call__(self, at: FloatArray | Monomials) -> FloatArray:
         """Values (T, *shape) at points (T, n)."""
         at = at if isinstance(at, Monomials) else Monomials(at)
-        return np.asarray((at.values(self.order) @ self._flat).reshape(len(at.points), *self._shape))
+        return np.asarray(
+            (at.values(self.order) @ self._flat).reshape(len(at.points), *self._shape)
+        )
 
 
 def best_order(points: FloatArray, values: FloatArray, least: int) -> int:
-    """Returns the order of a polynomial, from ``least`` on, whose fit to most samples is best on the others.
+    """Returns the order of a polynomial, from ``least`` on,
+    whose fit to most samples is best on the others.
 
     Args:
         points: (S, n).
@@ -78,7 +86,9 @@ def best_order(points: FloatArray, values: FloatArray, least: int) -> int:
 
 
 class SquaredPolynomial(Polynomial):
-    """Symmetric matrices (..., r, r) without negative eigenvalues, of n variables: squares of polynomials."""
+    """Symmetric matrices (..., r, r) without negative eigenvalues,
+    of n variables: squares of polynomials.
+    """
 
     @classmethod
     def fitted(cls, points: FloatArray, values: FloatArray, order: int) -> "SquaredPolynomial":
@@ -100,13 +110,19 @@ def powers(variables: int, order: int) -> IntArray:
     rows = []
     for degree in range(order + 1):
         for chosen in itertools.combinations_with_replacement(range(variables), degree):
-            rows.append(np.bincount(chosen, minlength=variables) if chosen else np.zeros(variables, dtype=np.int64))
+            rows.append(
+                np.bincount(chosen, minlength=variables)
+                if chosen
+                else np.zeros(variables, dtype=np.int64)
+            )
     return np.array(rows, dtype=np.int64)
 
 
 @cache
 def _products(variables: int, order: int) -> tuple[list[int], list[int]]:
-    """Factors of each monomial of this order: the numbers of a variable and of a monomial of lower order."""
+    """Factors of each monomial of this order: the numbers of a variable
+    and of a monomial of lower order.
+    """
     exponents = powers(variables, order)
     place = {tuple(row): number for number, row in enumerate(exponents.tolist())}
     rows = exponents[exponents.sum(1) == order]
@@ -116,9 +132,12 @@ def _products(variables: int, order: int) -> tuple[list[int], list[int]]:
 
 
 def solve_ridge(features: FloatArray, values: FloatArray, common_scale: bool = False) -> FloatArray:
-    """Solves least squares of values (S, V) on features (S, F), which may be collinear; returns (F, V).
+    """Solves least squares of values (S, V) on features (S, F), which may be collinear.
 
-    With a common scale, all features are scaled by the largest, so that rarely excited ones are regularised away.
+    Returns (F, V).
+
+    With a common scale, all features are scaled by the largest, so that rarely excited ones are
+    regularised away.
     """
     scale = np.sqrt(np.mean(features**2, axis=0))
     scale = np.full_like(scale, scale.max()) if common_scale else scale
@@ -129,6 +148,10 @@ def solve_ridge(features: FloatArray, values: FloatArray, common_scale: bool = F
 
 
 def around(point: FloatArray, step: float) -> FloatArray:
-    """Returns points (1 + k, ..., k) for differences: one (..., k), and it with each coordinate moved by a step."""
+    """Returns points (1 + k, ..., k) for differences: one (..., k),
+    and it with each coordinate moved by a step.
+    """
     k = point.shape[-1]
-    return np.asarray(point + step * np.eye(1 + k, k, -1).reshape(1 + k, *[1] * (point.ndim - 1), k))
+    return np.asarray(
+        point + step * np.eye(1 + k, k, -1).reshape(1 + k, *[1] * (point.ndim - 1), k)
+    )

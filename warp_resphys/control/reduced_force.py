@@ -1,6 +1,7 @@
 """The learned force in a reduced model: the robot's network, evaluated on a few modes.
 
-The network is evaluated in NumPy: for one state at a time, calling torch's layers takes longer than computing them.
+The network is evaluated in NumPy: for one state at a time, calling torch's layers takes longer than
+computing them.
 """
 
 from collections.abc import Callable
@@ -28,21 +29,36 @@ class Evaluator:
 
     Args:
         network: whose weights are final.
-        range_: to which its inputs are clipped, and beyond which its force may fade out; None for no clipping.
+        range_: to which its inputs are clipped, and beyond which its force may fade out; None for
+            no clipping.
     """
 
     def __init__(self, network: StateMap, range_: Range | None) -> None:
         assert isinstance(network.network, SkipMLP)
-        self._blocks = [[_layer(layer) for layer in cast(nn.Sequential, block)] for block in network.network.blocks]
-        self._linear, self._remainder = network.linear.numpy(force=True), network.remainder.numpy(force=True)
+        self._blocks = [
+            [_layer(layer) for layer in cast(nn.Sequential, block)]
+            for block in network.network.blocks
+        ]
+        self._linear, self._remainder = (
+            network.linear.numpy(force=True),
+            network.remainder.numpy(force=True),
+        )
         self._edges = None if range_ is None else [edge.numpy(force=True) for edge in range_.edges]
         self._fades = range_ if range_ is not None and range_.missed is not None else None
         if self._fades is not None:
-            self._nothing = network.encode_outputs(torch.zeros_like(network.rest)[None]).numpy(force=True)
+            self._nothing = network.encode_outputs(torch.zeros_like(network.rest)[None]).numpy(
+                force=True
+            )
 
     def __call__(self, inputs: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Returns standardised outputs (S, c) for inputs (S, i), and which of these (S,) are outside of the range."""
-        x: Array = inputs if self._edges is None else np.minimum(np.maximum(inputs, self._edges[0]), self._edges[1])
+        """Returns standardised outputs (S, c) for inputs (S, i),
+        and which of these (S,) are outside of the range.
+        """
+        x: Array = (
+            inputs
+            if self._edges is None
+            else np.minimum(np.maximum(inputs, self._edges[0]), self._edges[1])
+        )
         left = (x != inputs).any(1)
         fades = self._fades if left.any() else None
         hidden = x = x.astype(self._linear.dtype)
@@ -60,13 +76,17 @@ class Evaluator:
 
 def _layer(module: nn.Module) -> Layer:
     if isinstance(module, nn.Linear):
-        return partial(_affine, module.weight.numpy(force=True).T.copy(), module.bias.numpy(force=True))
+        return partial(
+            _affine, module.weight.numpy(force=True).T.copy(), module.bias.numpy(force=True)
+        )
     if isinstance(module, nn.SiLU):
         return _silu
     if isinstance(module, nn.ELU):
         return partial(_elu, float(module.alpha))
     assert isinstance(module, nn.LayerNorm)
-    return partial(_norm, module.weight.numpy(force=True), module.bias.numpy(force=True), float(module.eps))
+    return partial(
+        _norm, module.weight.numpy(force=True), module.bias.numpy(force=True), float(module.eps)
+    )
 
 
 def _affine(weight: Array, bias: Array, x: Array) -> Array:
@@ -74,7 +94,8 @@ def _affine(weight: Array, bias: Array, x: Array) -> Array:
 
 
 def _silu(x: Array) -> Array:
-    with np.errstate(over="ignore"):  # exp overflows for very negative x, where the quotient is zero
+    # exp overflows for very negative x, where the quotient is zero
+    with np.errstate(over="ignore"):
         return x / (1.0 + np.exp(-x))
 
 
@@ -89,10 +110,12 @@ def _norm(weight: Array, bias: Array, eps: float, x: Array) -> Array:
 
 @dataclass(frozen=True)
 class ReducedForce:
-    r"""G(u) (c - c_0(u)), with c the network's outputs for coordinates z, their rates, and inputs u.
+    r"""G(u) (c - c_0(u)), with c the network's outputs for coordinates z,
+    their rates, and inputs u.
 
-    The network's inputs are [p(u) + E(u) (z - z_0(u), z'), t + S (u, m)], standardised and clipped to the training
-    range, with m the filtered inputs. Beyond the range a force on an identified law fades out.
+    The network's inputs are [p(u) + E(u) (z - z_0(u), z'), t + S (u, m)], standardised and clipped
+    to the training range, with m the filtered inputs. Beyond the range a force on an identified law
+    fades out.
     """
 
     network: StateMap  # predicts a force in reduced modes
@@ -100,8 +123,8 @@ class ReducedForce:
     places: Polynomial  # p, (m,), standardised position and velocity modes at rest where z = z_0(u)
     seen: Polynomial  # E, (m, 2 r)
     conditions: FloatArray  # t, (k,), the network's standardised inputs beside the state, at u = 0
-    # S, (k, n (1 + F)), their derivatives by the inputs and the filtered inputs; empty where the network takes no
-    # inputs
+    # S, (k, n (1 + F)), their derivatives by the inputs and the filtered inputs; empty where the
+    # network takes no inputs
     conditions_by: FloatArray
     usual: Polynomial  # c_0, (c,)
     push: Polynomial  # G, (r, c)
@@ -127,7 +150,9 @@ class ForceAlong:
 
     left: BoolArray
 
-    def __init__(self, force: ReducedForce, u: Monomials, static: Polynomial, means: FloatArray) -> None:
+    def __init__(
+        self, force: ReducedForce, u: Monomials, static: Polynomial, means: FloatArray
+    ) -> None:
         base = static(u)
         at_rest = np.concatenate([base, np.zeros_like(base)], axis=1)
         self._evaluated = force.outputs

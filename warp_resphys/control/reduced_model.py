@@ -1,31 +1,39 @@
-r"""A reduced model of a robot: its equilibria, the slowest vibrations about them, and the learned force's network.
+r"""A reduced model of a robot: its equilibria, the slowest vibrations about them,
+and the learned force's network.
 
 In coordinates z = Psi^T M x of r modes,
 
-    z'' + D(u) z' + A(u) (z - z_0(u)) + sum_k B_k(u) y_k = G(u) (c - c_0(u)),    y_k' = z' - y_k / tau_k,
+    z'' + D(u) z' + A(u) (z - z_0(u)) + sum_k B_k(u) y_k = G(u) (c - c_0(u)),
+    y_k' = z' - y_k / tau_k,
 
-with u the inputs after their response to the commands, y_k what has not relaxed yet in a Prony branch, and c the
-outputs of the learned force's network, evaluated on the body that z and z' describe (hyper-reduction: no degree of
-freedom of the full model is left). z_0(u) is the equilibrium under u and a force of fixed outputs c_0(u), affine in u:
-a fit of the network's outputs. With Phi(u) the vibrations about it, K phi = omega^2 M phi, and T the orthogonal matrix
+with u the inputs after their response to the commands, y_k what has not relaxed yet in a Prony
+branch, and c the outputs of the learned force's network, evaluated on the body that z and z'
+describe (hyper-reduction: no degree of freedom of the full model is left). z_0(u) is the
+equilibrium under u and a force of fixed outputs c_0(u), affine in u: a fit of the network's
+outputs. With Phi(u) the vibrations about it, K phi = omega^2 M phi, and T the orthogonal matrix
 closest to Psi^T M Phi,
 
-    A = T (omega^2 - Phi^T dF/dx Phi) T^T,   D = T Phi^T V Phi T^T,   B_k = T Phi^T V_k Phi T^T,   G = T Phi^T dF/dc,
+    A = T (omega^2 - Phi^T dF/dx Phi) T^T,   D = T Phi^T V Phi T^T,
+    B_k = T Phi^T V_k Phi T^T,               G = T Phi^T dF/dc,
 
-where F is the learned force of fixed outputs, which turns with the body, and V and V_k are the damping of the full
-model and the stiffness of a branch. Observed points are y = y_0(u) + C(u) dz + H dz dz with dz = z - z_0(u); C is exact
-for small dz. The vertices are at x_0(u) + Psi dz. All are polynomials of those inputs that vary in the trials, of the
-order that is best on samples that were left out, fitted to equilibria and the vibrations about them (interpolation of
-reduced operators: Amsallem and Farhat, AIAA J. 46 (2008) 1803; here all share one basis Psi); D and B_k are squares of
-polynomials, so that no motion gains energy by them. H is constant, fitted to motions. As in the robot, the network is
-evaluated at the state before a step, so a step is linear in z. With s = (z, z'), and the integrator's g (1/3 where BDF2
-has a previous state, else 0) and step length h',
+where F is the learned force of fixed outputs, which turns with the body, and V and V_k are the
+damping of the full model and the stiffness of a branch. Observed points are
+y = y_0(u) + C(u) dz + H dz dz with dz = z - z_0(u); C is exact for small dz. The vertices are at
+x_0(u) + Psi dz. All are polynomials of those inputs that vary in the trials, of the order that is
+best on samples that were left out, fitted to equilibria and the vibrations about them
+(interpolation of reduced operators: Amsallem and Farhat, AIAA J. 46 (2008) 1803; here all share one
+basis Psi); D and B_k are squares of polynomials, so that no motion gains energy by them. H is
+constant, fitted to motions. As in the robot, the network is evaluated at the state before a step,
+so a step is linear in z. With s = (z, z'), and the integrator's g (1/3 where BDF2 has a previous
+state, else 0) and step length h',
 
-    s_{k+1} = L ((1 + g) s_k - g s_{k-1}) + J (A z_0 + P z_k - sum B e y + force(s_k)),     J = [N; N / h'],
-    N = (1 / h'^2 + D / h' + A + P)^-1,   P = sum B gamma,   y_{k+1} = e y_k + gamma (z_{k+1} - z_k),
+    s_{k+1} = L ((1 + g) s_k - g s_{k-1}) + J (A z_0 + P z_k - sum B e y + force(s_k)),
+    J = [N; N / h'],   N = (1 / h'^2 + D / h' + A + P)^-1,   P = sum B gamma,
+    y_{k+1} = e y_k + gamma (z_{k+1} - z_k),
 
-with sums over the branches, and e and gamma of `energies.viscosity`. B models are stepped together, so that differences
-of as many as there are variables give derivatives in one pass. Inputs are in units of `ReducedModel.scale`.
+with sums over the branches, and e and gamma of `energies.viscosity`. B models are stepped together,
+so that differences of as many as there are variables give derivatives in one pass. Inputs are in
+units of `ReducedModel.scale`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,7 +52,9 @@ from ..io.errors import ConvergenceError
 from .polynomials import Monomials, Polynomial, SquaredPolynomial, around
 from .reduced_force import ForceAlong, ReducedForce
 
-_REST_TOLERANCE: Final = 1e-6  # of equilibria, relative to the coordinates' size; networks are in float32
+_REST_TOLERANCE: Final = (
+    1e-6  # of equilibria, relative to the coordinates' size; networks are in float32
+)
 _ITERATIONS: Final = 50
 _SHARES: Final = 0.5 ** np.arange(8.0)  # of a step of Newton's method, of which the best is taken
 _DIFFERENCE: Final = 1e-3  # of coordinates for derivatives of the force, relative to their size
@@ -58,27 +68,39 @@ class ReducedState:
     z: FloatArray  # (B, r) coordinates
     v: FloatArray  # (B, r) their rates [1/s]
     strains: FloatArray  # (K, B, r) y_k of the Prony branches
-    acting: FloatArray  # (B, n') moving inputs after their response to the commands, in units of the model's scale
+    acting: FloatArray  # (B, n') moving inputs after their response to commands, in the scale
     memory: Mapping[str, FloatArray]  # of the inputs' response, entries (..., B, n)
     previous: FloatArray  # (2, B, r) coordinates and rates one step earlier
-    looks_back: BoolArray  # (B,) whether the integrator may use ``previous``; false before the first step
+    looks_back: (
+        BoolArray  # (B,) whether the integrator may use ``previous``; false before the first step
+    )
     left: BoolArray  # (B,) whether the learned force was ever evaluated outside its training range
-    lost: BoolArray  # (B,) whether a world has found that the model diverged; it stands at rest then
+    lost: (
+        BoolArray  # (B,) whether a world has found that the model diverged; it stands at rest then
+    )
 
     def moved(self, z: FloatArray, v: FloatArray, time_step: float) -> "ReducedState":
-        """Returns the state with its coordinates (B, r) and rates changed at once, and a past that fits them."""
+        """Returns the state with its coordinates (B, r) and rates changed at once,
+        and a past that fits them.
+        """
         previous = self.previous + np.stack([z - time_step * v, v])
-        return replace(self, z=self.z + z, v=self.v + v, strains=self.strains + z, previous=previous)
+        return replace(
+            self, z=self.z + z, v=self.v + v, strains=self.strains + z, previous=previous
+        )
 
     def where(self, chosen: BoolArray, other: "ReducedState") -> "ReducedState":
         """Joins two states: this one where chosen (B,), the other one elsewhere."""
         pairs = ((key, array, other.arrays()[key]) for key, array in self.arrays().items())
-        return self.from_arrays({k: np.where(chosen[:, None] if a.ndim > 1 else chosen, a, b) for k, a, b in pairs})
+        return self.from_arrays(
+            {k: np.where(chosen[:, None] if a.ndim > 1 else chosen, a, b) for k, a, b in pairs}
+        )
 
     def select(self, models: Sequence[int]) -> "ReducedState":
         """Returns the state of some models, by number."""
         rows = [*models]
-        return self.from_arrays({k: a[..., rows, :] if a.ndim > 1 else a[rows] for k, a in self.arrays().items()})
+        return self.from_arrays(
+            {k: a[..., rows, :] if a.ndim > 1 else a[rows] for k, a in self.arrays().items()}
+        )
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All arrays of the state by name."""
@@ -89,7 +111,9 @@ class ReducedState:
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "ReducedState":
         """Restores the state from its `arrays`."""
         arguments = {key: array for key, array in arrays.items() if not key.startswith("memory.")}
-        memory = {key.removeprefix("memory."): arrays[key] for key in arrays.keys() - arguments.keys()}
+        memory = {
+            key.removeprefix("memory."): arrays[key] for key in arrays.keys() - arguments.keys()
+        }
         return cls(memory=memory, **arguments)
 
 
@@ -102,7 +126,7 @@ class ReducedModel:
     labels: tuple[str, ...]  # of the M observed points
     name: str  # of the input
     scale: FloatArray  # (n,) of the inputs
-    range: FloatArray  # (2, n) least and largest commands of the trials; the model depends on the n' that differ
+    range: FloatArray  # (2, n) least and largest commands of the trials; n' of them differ
     acts: Mapping[str, Any]  # arguments of `InputResponse`, from the commands to the inputs
     filters: tuple[float, ...]  # F time constants of the filtered inputs that the network takes [s]
     times: tuple[float, ...]  # K relaxation times tau_k of the Prony branches [s]
@@ -141,7 +165,7 @@ class ReducedModel:
 
     @cached_property
     def response(self) -> InputResponse:
-        """Response of the inputs to the commands, and the filters whose outputs the network takes."""
+        """Response of the inputs to the commands, and filters whose outputs the network takes."""
         return InputResponse(self.time_step, **self.acts, filters=self.filters)
 
     @cached_property
@@ -164,16 +188,21 @@ class ReducedModel:
         return ReducedState(still[0], still[1], relaxed, u, memory, still, no, no, no)
 
     def _equilibrium(self, u: Monomials) -> FloatArray:
-        """Coordinates (S, r) with A (z - z_0) = learned force, by Newton's method with step halving."""
+        """Coordinates (S, r) with A (z - z_0) = learned force,
+        by Newton's method with step halving.
+        """
         a, base = self.stiffness(u), self.static(u)
         if self.force is None:
             return base
-        size, means = np.abs(self.static.coefficients).max(), np.repeat(u.points[None], len(self.filters), axis=0)
+        size = np.abs(self.static.coefficients).max()
+        means = np.repeat(u.points[None], len(self.filters), axis=0)
 
         def imbalance(z: FloatArray) -> FloatArray:
             """Residuals (K, S, r) of K trials."""
             flat, count = z.reshape(-1, self.modes), len(z)
-            force = self._force(Monomials(np.tile(u.points, (count, 1))), np.tile(means, (1, count, 1)))
+            force = self._force(
+                Monomials(np.tile(u.points, (count, 1))), np.tile(means, (1, count, 1))
+            )
             assert force is not None
             pushed = force(slice(None), np.stack([flat, np.zeros_like(flat)]))
             return np.asarray((a @ (z - base)[..., None])[..., 0] - pushed.reshape(z.shape))
@@ -191,7 +220,9 @@ class ReducedModel:
             change = np.linalg.solve(slope, residual[0][..., None])[..., 0]
             trials = z - _SHARES[:, None, None] * change
             z = trials[error(imbalance(trials)).argmin()]
-        raise ConvergenceError("the reduced model has no equilibrium: its learned force is too large.", z, None)
+        raise ConvergenceError(
+            "the reduced model has no equilibrium: its learned force is too large.", z, None
+        )
 
     def _force(self, u: Monomials, means: FloatArray) -> ForceAlong | None:
         return None if self.force is None else ForceAlong(self.force, u, self.static, means)
@@ -212,7 +243,9 @@ class ReducedModel:
     def positions(self, state: ReducedState) -> FloatArray:
         """Displacements (B, N, 3) of the vertices in a state [m]."""
         u = Monomials(state.acting)
-        return (self.shape(u) + (state.z - self.static(u)) @ self.basis.T).reshape(len(state.z), -1, 3)
+        return (self.shape(u) + (state.z - self.static(u)) @ self.basis.T).reshape(
+            len(state.z), -1, 3
+        )
 
     def points(self, z: FloatArray, u: Monomials) -> FloatArray:
         """Observed points (S, 3 M) at coordinates (S, r) under S inputs [m]."""
@@ -242,7 +275,8 @@ class ReducedModel:
             bias: (r,) or (B, r), added to the equilibria z_0.
 
         Returns:
-            Coordinates (T, B, r) after each step, monomials of the (T B, n') moving inputs, and the last state.
+            Coordinates (T, B, r) after each step, monomials of the (T B, n') moving inputs, and the
+            last state.
         """
         acting, means, memory = self.response(start.memory, inputs)
         acting, means = self._moving(acting), self._moving(means)
@@ -255,7 +289,8 @@ class ReducedModel:
         base, a, damping = self.static(u), self.stiffness(u), self.damping(u)
         inertia = np.eye(r) / step[..., None] ** 2 + damping / step[..., None]
         branches, (decay, gamma) = self.branches(u), self.relaxation
-        relaxed, carried = np.einsum("k,skrq->srq", gamma, branches), decay[:, None, None] * branches
+        relaxed = np.einsum("k,skrq->srq", gamma, branches)
+        carried = decay[:, None, None] * branches
         inverse = np.linalg.inv(inertia + a + relaxed)
         shifted = base if bias is None else (base.reshape(steps, batch, r) + bias).reshape(-1, r)
         pull = (a @ shifted[..., None])[..., 0]
@@ -266,7 +301,9 @@ class ReducedModel:
             rows = slice(k * batch, (k + 1) * batch)
             at, rate = (1.0 + share[rows]) * now - share[rows] * before
             right = (inertia[rows] @ at[..., None])[..., 0] + rate / step[rows] + pull[rows]
-            right += (relaxed[rows] @ now[0, ..., None])[..., 0] - np.einsum("bkrq,kbq->br", carried[rows], strain)
+            right += (relaxed[rows] @ now[0, ..., None])[..., 0] - np.einsum(
+                "bkrq,kbq->br", carried[rows], strain
+            )
             if force is not None:
                 right += force(rows, now)
                 left = left | force.left
@@ -275,15 +312,21 @@ class ReducedModel:
             now, before = np.stack([z, (z - at) / step[rows]]), now
             states.append(z)
         looks_back = np.ones(batch, dtype=np.bool_)
-        end = ReducedState(now[0], now[1], strain, acting[-1], memory, before, looks_back, left, start.lost)
+        end = ReducedState(
+            now[0], now[1], strain, acting[-1], memory, before, looks_back, left, start.lost
+        )
         return np.stack(states), u, end
 
     def relaxed(self, strains: FloatArray, change: FloatArray) -> FloatArray:
         """Returns y_k after a step in which the coordinates change; (K, ...) and (...)."""
-        decay, gamma = (value.reshape(-1, *np.ones(change.ndim, dtype=int)) for value in self.relaxation)
+        decay, gamma = (
+            value.reshape(-1, *np.ones(change.ndim, dtype=int)) for value in self.relaxation
+        )
         return np.asarray(decay * strains + gamma * change)
 
-    def respond(self, start: ReducedState, inputs: FloatArray, bias: FloatArray | None = None) -> FloatArray:
+    def respond(
+        self, start: ReducedState, inputs: FloatArray, bias: FloatArray | None = None
+    ) -> FloatArray:
         """Predicts the observed points (T, B, 3 M) of B motions over T steps [m].
 
         Args:
@@ -302,7 +345,9 @@ class ReducedModel:
         stiffness = self.stiffness(np.zeros((1, len(self.moving))))[0]
         return np.concatenate([moved, moved * np.sqrt(np.abs(np.diag(stiffness))), moved])
 
-    def transition(self, start: ReducedState, inputs: FloatArray, bias: FloatArray) -> tuple[ReducedState, FloatArray]:
+    def transition(
+        self, start: ReducedState, inputs: FloatArray, bias: FloatArray
+    ) -> tuple[ReducedState, FloatArray]:
         """Advances B models by a step, and the first also from other states.
 
         Args:
@@ -311,12 +356,14 @@ class ReducedModel:
             bias: (B, r), added to the equilibria z_0.
 
         Returns:
-            Their state after it, and derivatives (2 r, 3 r) of that of the first model by z, v and the bias, where z
-            and v are moved with their past (`ReducedState.moved`).
+            Their state after it, and derivatives (2 r, 3 r) of that of the first model by z, v and
+            the bias, where z and v are moved with their past (`ReducedState.moved`).
         """
         count, r = len(bias), self.modes
         rows = [*range(count), *([0] * 3 * r)]
-        z, v, b = np.split(np.concatenate([np.zeros((count, 3 * r)), np.diag(self.amounts)]), 3, axis=1)
+        z, v, b = np.split(
+            np.concatenate([np.zeros((count, 3 * r)), np.diag(self.amounts)]), 3, axis=1
+        )
         states = start.select(rows).moved(z, v, self.time_step)
         end = self.move(states, np.tile(inputs, (1, len(rows), 1)), bias[rows] + b)[2]
         after = np.concatenate([end.z, end.v], axis=1)

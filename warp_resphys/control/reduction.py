@@ -1,4 +1,6 @@
-"""Fits a reduced model to a robot: to equilibria, vibrations about them, and motions, sampled in its input range."""
+"""Fits a reduced model to a robot: to equilibria, vibrations about them,
+and motions, sampled in its input range.
+"""
 
 import hashlib
 import json
@@ -50,9 +52,12 @@ class _Statics(NamedTuple):
 
 
 def reduced_of(robot: Robot) -> ReducedModel:
-    """Returns the reduced model of a robot, from its run's folder; it is computed and kept there the first time.
+    """Returns the reduced model of a robot, from its run's folder.
 
-    That of a robot with other parameters than its run has identified is not kept. A twin and environments use it.
+    It is computed and kept there the first time.
+
+    That of a robot with other parameters than its run has identified is not kept. A twin and
+    environments use it.
 
     Raises:
         InputError: the robot cannot be reduced.
@@ -77,13 +82,19 @@ def reduced_of(robot: Robot) -> ReducedModel:
     off, moved = model.quality["window_error_mm"], model.quality["window_motion_mm"]
     if off > _MUCH * moved:
         log.warning(
-            "The reduced model is %.2g mm off in motions of %.2g mm: compare it with the full simulator.", off, moved
+            "The reduced model is %.2g mm off in motions of %.2g mm: "
+            "compare it with the full simulator.",
+            off,
+            moved,
         )
     return model
 
 
 def reduce(
-    robot: Robot, samples: ReductionSettings, seed: int = 0, on_progress: OnProgress = lambda steps: None
+    robot: Robot,
+    samples: ReductionSettings,
+    seed: int = 0,
+    on_progress: OnProgress = lambda steps: None,
 ) -> ReducedModel:
     """Fits the reduced model of a robot.
 
@@ -95,7 +106,8 @@ def reduce(
 
     Raises:
         InputError: the robot cannot be reduced, or is not driven by exactly one input.
-        ConvergenceError: the robot or the reduced model has no equilibrium for inputs in the range of the trials.
+        ConvergenceError: the robot or the reduced model has no equilibrium for inputs in the range
+            of the trials.
     """
     check_reducible(robot)
     source = Source(robot, driven_input(robot))
@@ -104,7 +116,11 @@ def reduce(
     tangents = []
     for row in range(min(samples.tangents, len(statics.u))):
         outputs = None if statics.outputs is None else statics.outputs[row]
-        tangents.append(source.tangent(statics.q[row : row + 1], statics.commands[row], max(samples.modes), outputs))
+        tangents.append(
+            source.tangent(
+                statics.q[row : row + 1], statics.commands[row], max(samples.modes), outputs
+            )
+        )
         on_progress(1)
     on_progress(samples.tangents - len(tangents))
     counts = {"asked": samples.equilibria, "equilibria": len(statics.u), "tangents": len(tangents)}
@@ -120,22 +136,32 @@ def reduce(
     best = min(models, key=lambda model: model.quality["window_error_mm"])
     best = replace(best, robot=fingerprint(robot))
     tried = {str(model.modes): model.quality["window_relative"] for model in models}
-    return replace(best, quality={**best.quality, **counts, "motions": samples.motions, "tried": tried})
+    return replace(
+        best, quality={**best.quality, **counts, "motions": samples.motions, "tried": tried}
+    )
 
 
 def fingerprint(robot: Robot) -> str:
-    """Returns a digest of everything that a robot's reduced model depends on, except the amount of samples."""
+    """Returns a digest of everything that a robot's reduced model depends on,
+    except the amount of samples.
+    """
     about, learned = robot.description, robot.description.learned
-    arrays: dict[str, ArrayLike] = {name: value.numpy(force=True) for name, value in robot.parameters.items()}
+    arrays: dict[str, ArrayLike] = {
+        name: value.numpy(force=True) for name, value in robot.parameters.items()
+    }
     arrays |= {"mesh": about.mesh.vertices, "cells": about.mesh.cells}
     arrays |= {} if about.bound is None else {"bound": about.bound.numpy(force=True)}
     if learned is not None:
-        arrays |= {name: value.numpy(force=True) for name, value in learned.network.state_dict().items()}
+        arrays |= {
+            name: value.numpy(force=True) for name, value in learned.network.state_dict().items()
+        }
     of_simulator = Plain({})
     plain = [*about.made_of(of_simulator), about.seen, about.placement, robot.labels]
     arrays |= {name: tensor.numpy() for name, tensor in of_simulator.tensors.items()}
     plain += [{name: network.plain()} for name, network in about.actuator.items()]
-    made = hashlib.sha256(json.dumps(to_plain([*plain, robot.simulator.integrator, robot.time_step])).encode())
+    made = hashlib.sha256(
+        json.dumps(to_plain([*plain, robot.simulator.integrator, robot.time_step])).encode()
+    )
     for name, array in sorted(arrays.items()):
         made.update(name.encode() + np.ascontiguousarray(array, dtype=np.float32).tobytes())
     return made.hexdigest()
@@ -144,7 +170,8 @@ def fingerprint(robot: Robot) -> str:
 def _fitted(
     source: Source, tangents: Sequence[Tangent], statics: _Statics, motions: Motions, first: int
 ) -> ReducedModel:
-    """Fits a model with a coordinate for each vibration to the first motions, and measures its error on the others.
+    """Fits a model with a coordinate for each vibration to the first motions,
+    and measures its error on the others.
 
     Raises:
         ConvergenceError: the model has no equilibrium, or diverges.
@@ -159,11 +186,18 @@ def _fitted(
             motions.y[1:, :first].reshape(-1, motions.y.shape[2]),
         ),
     )
-    frequency = np.sqrt(np.abs(np.linalg.eigvals(model.stiffness(statics.u[:1])[0]))) / (2.0 * np.pi)
+    frequency = np.sqrt(np.abs(np.linalg.eigvals(model.stiffness(statics.u[:1])[0]))) / (
+        2.0 * np.pi
+    )
     quality: dict[str, Any] = _errors(model, motions, z, rates, first)
     if not np.isfinite(quality["window_error_mm"]):
-        raise ConvergenceError(f"the reduced model of {model.modes} modes diverges.", statics.q, None)
-    return replace(model, quality={**quality, "modes": model.modes, "frequencies_hz": np.sort(frequency).tolist()})
+        raise ConvergenceError(
+            f"the reduced model of {model.modes} modes diverges.", statics.q, None
+        )
+    return replace(
+        model,
+        quality={**quality, "modes": model.modes, "frequencies_hz": np.sort(frequency).tolist()},
+    )
 
 
 def _equilibria(source: Source, asked: int, seed: int, on_progress: OnProgress) -> _Statics:
@@ -174,7 +208,8 @@ def _equilibria(source: Source, asked: int, seed: int, on_progress: OnProgress) 
     """
     from scipy.stats import qmc
 
-    unit = qmc.Sobol(source.parts, seed=seed).random(2 ** int(np.ceil(np.log2(max(asked, 2)))))[:asked]
+    unit = qmc.Sobol(source.parts, seed=seed).random(2 ** int(np.ceil(np.log2(max(asked, 2)))))
+    unit = unit[:asked]
     commands = source.commands(unit)
     commands[0] = np.clip(0.0, *source.commands(np.array([[0.0], [1.0]])))
     batches = []
@@ -182,17 +217,20 @@ def _equilibria(source: Source, asked: int, seed: int, on_progress: OnProgress) 
         for some in np.array_split(commands, -(-asked // _BATCH)):
             batches.append(source.equilibria(some))
             on_progress(len(some))
-        q, commands = torch.cat([batch[0] for batch in batches]), np.concatenate([batch[1] for batch in batches])
+        q = torch.cat([batch[0] for batch in batches])
+        commands = np.concatenate([batch[1] for batch in batches])
         y = source.robot.observe(State(q, torch.zeros_like(q))).flatten(1).double().cpu().numpy()
     if len(commands) < _LEAST_SETTLED * asked:
         raise ConvergenceError(
-            f"the robot has an equilibrium under {len(commands)} of {asked} inputs in its range: its learned force is "
-            "too large for a reduced model.",
+            f"the robot has an equilibrium under {len(commands)} of {asked} inputs in its range: "
+            "its learned force is too large for a reduced model.",
             q,
             None,
         )
     outputs = [batch[2] for batch in batches if batch[2] is not None]
-    return _Statics(q, y, commands, source.acting(commands), np.concatenate(outputs) if outputs else None)
+    return _Statics(
+        q, y, commands, source.acting(commands), np.concatenate(outputs) if outputs else None
+    )
 
 
 class _Subspace(NamedTuple):
@@ -206,7 +244,9 @@ class _Subspace(NamedTuple):
     rates: FloatArray  # (T + 1, B, r) [1/s]
 
 
-def _subspace(source: Source, tangents: Sequence[Tangent], statics: _Statics, motions: Motions) -> _Subspace:
+def _subspace(
+    source: Source, tangents: Sequence[Tangent], statics: _Statics, motions: Motions
+) -> _Subspace:
     """Returns the common subspace of vibrations, and the samples in its coordinates."""
     shapes = torch.stack([tangent.shapes for tangent in tangents])
     basis = _common(shapes, source.mass)
@@ -227,25 +267,33 @@ def _assembled(
     """Fits the dynamics of the model, without y_0 and H.
 
     Returns:
-        The model, coordinates (S, r) of the equilibria, and coordinates and rates (T + 1, B, r) of the motions.
+        The model, coordinates (S, r) of the equilibria, and coordinates and rates (T + 1, B, r) of
+        the motions.
     """
     space, u = _subspace(source, tangents, statics, motions), statics.u
     turned, known = space.turned, u[: len(tangents)]
     stiff = turned @ np.stack([tangent.stiffness for tangent in tangents]) @ turned.mT
-    order, tangent_order = best_order(u, statics.y, STATIC_ORDER), best_order(known, stiff, TANGENT_ORDER)
+    order = best_order(u, statics.y, STATIC_ORDER)
+    tangent_order = best_order(known, stiff, TANGENT_ORDER)
 
     def fitted(values: FloatArray) -> Polynomial:
         return Polynomial.fitted(known, values, tangent_order)
 
     def squared(values: FloatArray) -> SquaredPolynomial:
         """Fits matrices (S', ..., r, r) of the vibrations."""
-        turn = turned.reshape(len(tangents), *np.ones(values.ndim - 3, dtype=int), *turned.shape[1:])
-        return SquaredPolynomial.fitted(known, turn @ values @ turn.mT, max(tangent_order, STATIC_ORDER))
+        turn = turned.reshape(
+            len(tangents), *np.ones(values.ndim - 3, dtype=int), *turned.shape[1:]
+        )
+        return SquaredPolynomial.fitted(
+            known, turn @ values @ turn.mT, max(tangent_order, STATIC_ORDER)
+        )
 
     stiffness = fitted(stiff)
     force, moved = _reduced_force(source, tangents, statics, space, stiffness, order, fitted)
     static, psi = Polynomial.fitted(u, space.statics - moved, order), space.basis.cpu().numpy()
-    shape = (statics.q - source.rest).flatten(1).double().cpu().numpy() - (space.statics - static(u)) @ psi.T
+    shape = (statics.q - source.rest).flatten(1).double().cpu().numpy() - (
+        space.statics - static(u)
+    ) @ psi.T
     modes, points = psi.shape[1], 3 * len(source.robot.labels)
     model = ReducedModel(
         source.robot.time_step,
@@ -280,29 +328,41 @@ def _reduced_force(
     order: int,
     fitted: Callable[[FloatArray], Polynomial],
 ) -> tuple[ReducedForce | None, FloatArray]:
-    """Returns the learned force of a model, and by how much (S, r) the deviation of its outputs moves the equilibria.
+    """Returns the learned force of a model, and by how much (S, r) the deviation
+    of its outputs moves the equilibria.
 
-    This deviation from c_0 is subtracted through the model's linear response, so that z_0 and p are smooth functions of
-    the inputs even if the network is not.
+    This deviation from c_0 is subtracted through the model's linear response, so that z_0 and p are
+    smooth functions of the inputs even if the network is not.
     """
     if statics.outputs is None or source.learned is None:
         return None, np.zeros_like(space.statics)
     u, network, back = statics.u, source.learned.network, space.turned.mT
-    push = fitted(space.turned @ np.stack([tangent.push for tangent in tangents if tangent.push is not None]))
+    push = fitted(
+        space.turned @ np.stack([tangent.push for tangent in tangents if tangent.push is not None])
+    )
     usual = Polynomial.fitted(u, statics.outputs, USUAL_ORDER)
     off = push(u) @ (statics.outputs - usual(u))[..., None]
     moved: FloatArray = np.asarray(np.linalg.solve(stiffness(u), off)[..., 0], dtype=np.float64)
-    both = [_modes_seen(coder, space.shapes, back) for coder in (network.position, network.velocity)]
+    both = [
+        _modes_seen(coder, space.shapes, back) for coder in (network.position, network.velocity)
+    ]
     seen = fitted(np.stack([scipy.linalg.block_diag(*pair) for pair in zip(*both, strict=True)]))
-    places = network.position.encode((statics.q - network.rest.to(statics.q)).double()).cpu().numpy()
+    places = (
+        network.position.encode((statics.q - network.rest.to(statics.q)).double()).cpu().numpy()
+    )
     places = np.pad(places, ((0, 0), (0, both[1].shape[1])))  # The rates are zero.
     places = places - (seen(u)[..., : moved.shape[1]] @ moved[..., None])[..., 0]
     at_rest = Polynomial.fitted(u, places, order)
-    return ReducedForce(network, source.learned.range_, at_rest, seen, *source.conditions(), usual, push), moved
+    return ReducedForce(
+        network, source.learned.range_, at_rest, seen, *source.conditions(), usual, push
+    ), moved
 
 
 def _modes_seen(coder: Coder, shapes: torch.Tensor, back: FloatArray) -> FloatArray:
-    """Standardised modes of a coder as functions of the coordinates, (S, m, r); m is 0 without modes."""
+    """Standardised modes of a coder as functions of the coordinates, (S, m, r).
+
+    M is 0 without modes.
+    """
     if coder.basis is None or not coder.size:
         return np.zeros((len(back), 0, back.shape[1]))
     basis = (coder.basis / coder.scale).to(shapes)
@@ -310,7 +370,8 @@ def _modes_seen(coder: Coder, shapes: torch.Tensor, back: FloatArray) -> FloatAr
 
 
 def _common(shapes: torch.Tensor, mass: torch.Tensor) -> torch.Tensor:
-    """Basis Psi (3 N, r), orthonormal in the mass, of the best common subspace of vibrations (S, 3 N, r).
+    """Basis Psi (3 N, r), orthonormal in the mass, of the best common subspace
+    of vibrations (S, 3 N, r).
 
     In that subspace it is closest to the first of them, so that A is nearly diagonal there.
     """
@@ -321,11 +382,14 @@ def _common(shapes: torch.Tensor, mass: torch.Tensor) -> torch.Tensor:
     return torch.where(root > 0.0, basis @ left @ right / root.clamp_min(1e-300), 0.0)
 
 
-def _with_output(model: ReducedModel, rests: tuple[FloatArray, ...], motions: tuple[FloatArray, ...]) -> ReducedModel:
+def _with_output(
+    model: ReducedModel, rests: tuple[FloatArray, ...], motions: tuple[FloatArray, ...]
+) -> ReducedModel:
     """Adds y_0, fitted to equilibria, and H, fitted to motions.
 
-    Both arguments are coordinates (S, r), inputs (S, n) and observed points (S, 3 M) [m]. Fast motions excite more
-    modes than the model has; fitted to them as well, y_0 would compensate for these and be wrong at rest.
+    Both arguments are coordinates (S, r), inputs (S, n) and observed points (S, 3 M) [m]. Fast
+    motions excite more modes than the model has; fitted to them as well, y_0 would compensate for
+    these and be wrong at rest.
     """
 
     def residual(z: FloatArray, u: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -342,8 +406,12 @@ def _with_output(model: ReducedModel, rests: tuple[FloatArray, ...], motions: tu
     return replace(model, observed=observed, curved=curved + curved.swapaxes(0, 1))
 
 
-def _errors(model: ReducedModel, motions: Motions, z: FloatArray, rates: FloatArray, first: int) -> dict[str, float]:
-    """Distances of the model from the robot over windows and whole motions, for the motions from ``first`` on [mm]."""
+def _errors(
+    model: ReducedModel, motions: Motions, z: FloatArray, rates: FloatArray, first: int
+) -> dict[str, float]:
+    """Distances of the model from the robot over windows and whole motions,
+    for the motions from ``first`` on [mm].
+    """
     steps = round(_WINDOW / model.time_step)
     z, rates, y, acting, commands = (
         series[:, first:] for series in (z, rates, motions.y, motions.acting, motions.commands)
@@ -356,8 +424,19 @@ def _errors(model: ReducedModel, motions: Motions, z: FloatArray, rates: FloatAr
     off, moved, looks = [], [], np.ones(z.shape[1], dtype=np.bool_)
     for at in range(2, len(commands) - steps, max(steps // 3, 1)):
         before = np.stack([z[at - 1], rates[at - 1]])
-        start = ReducedState(z[at], rates[at], strains[at], acting[at - 1], memories[at], before, looks, ~looks, ~looks)
-        predicted, true = model.respond(start, commands[at : at + steps]), y[at + 1 : at + steps + 1]
+        start = ReducedState(
+            z[at],
+            rates[at],
+            strains[at],
+            acting[at - 1],
+            memories[at],
+            before,
+            looks,
+            ~looks,
+            ~looks,
+        )
+        predicted = model.respond(start, commands[at : at + steps])
+        true = y[at + 1 : at + steps + 1]
         off.append(_distances(predicted, true).mean())
         moved.append(_distances(np.broadcast_to(y[at], true.shape), true).mean())
     whole = model.respond(model.rest(), commands)

@@ -26,8 +26,8 @@ OnProgress = Callable[[int], None]
 _OF_MEDIUM: Final = ("added_layer", "drag_linear", "drag_normal", "drag_tangential")
 _MORE_MODES: Final = 1.5  # computed vibrations per kept one, so that the slowest are accurate
 _MEAN, _DEVIATION = 0.4, 0.45  # of sampled inputs, as shares of their range
-# Correlation times of the inputs [s]: the shortest in motions for fitting, the shortest in those for the error, and the
-# longest in both.
+# Correlation times of the inputs [s]: the shortest in motions for fitting, the shortest in those
+# for the error, and the longest in both.
 _FASTEST, _FAST, _SLOWEST = 0.05, 0.25, 0.45
 
 
@@ -39,7 +39,7 @@ class Motions:
     v: torch.Tensor  # (T + 1, B, N, 3) [m/s]
     y: FloatArray  # (T + 1, B, 3 M) observed points [m]
     commands: FloatArray  # (T, B, n) in the unit of the input
-    acting: FloatArray  # (T, B, n') moving inputs after their response to the commands, in units of the scale
+    acting: FloatArray  # (T, B, n') moving inputs after their response to commands, in the scale
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Tangent:
     shapes: torch.Tensor  # (3 N, r), orthonormal in the mass
     stiffness: FloatArray  # (r, r) [1/s^2]
     damping: FloatArray  # (r, r) [1/s]
-    shown: FloatArray  # (3 M, r) derivatives of the observed points with respect to the vibrations' amplitudes
+    shown: FloatArray  # (3 M, r) derivatives of the observed points by the vibrations' amplitudes
     branches: FloatArray  # (K, r, r) of the Prony branches [1/s^2]
     # (r, c) derivatives of the force with respect to the network's outputs; None without a network
     push: FloatArray | None
@@ -75,15 +75,16 @@ def driven_input(robot: Robot) -> RobotInput:
     inputs = [robot.inputs[name] for name in robot.driven if name in robot.description.seen]
     if len(inputs) != 1:
         raise InputError(
-            f"a reduced model needs a robot whose trials are driven by one input, and {robot.description.name} has "
-            f"{len(inputs) or 'none'}: choose a run with pressures, tendons or muscles, or give Robot.of the ranges of "
-            "one input."
+            "a reduced model needs a robot whose trials are driven by one input, and "
+            f"{robot.description.name} has {len(inputs) or 'none'}: choose a run with pressures, "
+            "tendons or muscles, or give Robot.of the ranges of one input."
         )
     return inputs[0]
 
 
 def settle_some(robot: Robot, batch: int, **inputs: Given) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns positions (B, N, 3) of `Robot.settle` [m], and (B,) bool, which environments are in equilibrium.
+    """Returns positions (B, N, 3) of `Robot.settle` [m], and (B,) bool,
+    which environments are in equilibrium.
 
     Raises:
         InputError: an invalid input, as for `Robot.step`.
@@ -116,8 +117,9 @@ def check_reducible(robot: Robot) -> None:
     """Refuses a robot that cannot be reduced.
 
     Raises:
-        InputError: a data-driven robot, one that is not driven by exactly one input, without markers, with a moving
-            base, friction, a medium or obstacles, that is stepped by the midpoint rule, or whose network is nodal.
+        InputError: a data-driven robot, one that is not driven by exactly one input, without
+            markers, with a moving base, friction, a medium or obstacles, that is stepped by the
+            midpoint rule, or whose network is nodal.
     """
     description = robot.description
     if robot.is_data_driven:
@@ -129,18 +131,27 @@ def check_reducible(robot: Robot) -> None:
         raise InputError(f"the base of {description.name} moves: reduced models have a fixed base.")
     if robot.simulator.integrator not in ("implicit_euler", "bdf2"):
         raise InputError(
-            f"a robot that is stepped by {robot.simulator.integrator} cannot be reduced: set identify.integrator to "
-            "implicit_euler or bdf2."
+            f"a robot that is stepped by {robot.simulator.integrator} cannot be reduced: set "
+            "identify.integrator to implicit_euler or bdf2."
         )
     if any(getattr(energy, "memory", ()) for energy in robot.simulator.body.energies):
-        raise InputError("an energy with memory, such as friction, cannot be reduced: use the full simulator.")
+        raise InputError(
+            "an energy with memory, such as friction, cannot be reduced: use the full simulator."
+        )
     if any(getattr(energy, "is_barrier", False) for energy in robot.simulator.body.energies):
-        raise InputError("a robot in contact cannot be reduced, as contact has no basis: use the full simulator.")
+        raise InputError(
+            "a robot in contact cannot be reduced, as contact has no basis: use the full simulator."
+        )
     for name in (*_OF_MEDIUM, "tendon_friction"):
         if name in robot.simulator.parameters and bool((_value(robot, name) != 0.0).any()):
-            raise InputError(f"{name} is no stiffness, so that this robot cannot be reduced: use the full simulator.")
+            raise InputError(
+                f"{name} is no stiffness, so that this robot cannot be reduced: "
+                "use the full simulator."
+            )
     network = None if description.learned is None else description.learned.network
-    if network is not None and any(coder.basis is None for coder in (network.position, *network.coders)):
+    if network is not None and any(
+        coder.basis is None for coder in (network.position, *network.coders)
+    ):
         raise InputError("a nodal network cannot be reduced: train one with network.kind=reduced.")
 
 
@@ -168,14 +179,22 @@ class Source:
         self.moving = np.flatnonzero(np.ptp(self.range, axis=0))
         self.acts = response_of(driven.quantity, values, driven.parts, robot.description.actuator)
         self.response = InputResponse(robot.time_step, **self.acts)
-        # Parts are also commanded one at a time, as a learned actuator may let one part reduce the input of another.
+        # Parts are also commanded one at a time, as a learned actuator may let one part reduce the
+        # input of another.
         alone = self.range[0] + np.diag(np.ptp(self.range, axis=0))
         reach = np.abs(self.response.still(np.concatenate([self.range, alone]))).max(0)
         self.scale = np.where(reach > 0.0, reach, 1.0)
-        damping = {name: 0.0 for name in simulator.parameters if name.endswith((*VISCOUS, MASS_DAMPING))}
-        words = {name: word for name in simulator.parameters for word in PRONY_RATIOS if word in name}
+        damping = {
+            name: 0.0 for name in simulator.parameters if name.endswith((*VISCOUS, MASS_DAMPING))
+        }
+        words = {
+            name: word for name in simulator.parameters for word in PRONY_RATIOS if word in name
+        }
         ratios = dict.fromkeys(words, 0.0)
-        self._viscous, self._elastic = robot.with_parameters(**ratios), robot.with_parameters(**damping, **ratios)
+        self._viscous, self._elastic = (
+            robot.with_parameters(**ratios),
+            robot.with_parameters(**damping, **ratios),
+        )
         self._branches, times = list[Robot](), list[float]()
         for name, word in words.items():
             others = {other: 0.0 for other in ratios if other != name}
@@ -201,10 +220,11 @@ class Source:
         return {self.input.name: self.robot.simulator.tensor(commands)}
 
     def conditions(self) -> tuple[FloatArray, FloatArray]:
-        """Standardised inputs (k,) of the network beside the state, at zero inputs, and their derivatives.
+        """Standardised inputs (k,) of the network beside the state,
+        at zero inputs, and their derivatives.
 
-        The derivatives (k, n' (1 + F)) are by the moving inputs and the filtered ones; both are empty where the network
-        takes no inputs.
+        The derivatives (k, n' (1 + F)) are by the moving inputs and the filtered ones; both are
+        empty where the network takes no inputs.
         """
         network = None if self.learned is None else self.learned.network
         if network is None or network.actuation is None:
@@ -220,12 +240,17 @@ class Source:
         changes = np.pad(changes, ((0, 0), (conditions.shape[1] - len(changes), 0)))
         encode = network.actuation.encode
         base = encode(conditions)
-        changes = changes.reshape(blocks, -1, changes.shape[1])[:, self.moving].reshape(-1, changes.shape[1])
+        changes = changes.reshape(blocks, -1, changes.shape[1])[:, self.moving].reshape(
+            -1, changes.shape[1]
+        )
         by = encode(conditions + torch.as_tensor(changes).to(conditions)) - base
         return base[0].cpu().numpy(), by.mT.cpu().numpy()
 
     def motions(self, samples: ReductionSettings, seed: int, on_progress: OnProgress) -> Motions:
-        """Simulates motions under smooth random inputs; the first half, for fitting, includes faster ones."""
+        """Simulates motions under smooth random inputs.
+
+        The first half, for fitting, includes faster ones.
+        """
         robot, steps = self.robot, max(round(samples.seconds / self.robot.time_step), 20)
         random, batch = np.random.default_rng(seed), 2 * samples.motions
         drawn = []
@@ -233,7 +258,9 @@ class Source:
             fastest = _FASTEST if number < samples.motions else _FAST
             time = float(np.exp(random.uniform(np.log(fastest), np.log(_SLOWEST))))
             rest = 2.0 * robot.time_step
-            source = SequenceSettings(mean=_MEAN, deviation=_DEVIATION, correlation_time=time, rest=rest)
+            source = SequenceSettings(
+                mean=_MEAN, deviation=_DEVIATION, correlation_time=time, rest=rest
+            )
             drawn.append(draw_inputs(source, 1.0, steps, robot.time_step, self.parts, random)[1:])
         commands = self.commands(np.stack(drawn, axis=1))
         every = max(steps // samples.tenths, 1)
@@ -259,17 +286,24 @@ class Source:
         assert self.learned is not None
         network, conditions = self.learned.network, self.robot.acting(state, **commands).conditions
         like = network.rest
-        conditions = None if conditions is None or network.actuation is None else conditions.to(like)
+        conditions = (
+            None if conditions is None or network.actuation is None else conditions.to(like)
+        )
         inputs = network.encode(state.q.to(like), state.v.to(like), conditions)
         range_ = self.learned.range_
-        outputs = network.standardised(inputs) if range_ is None else range_.outputs(network, inputs)
+        outputs = (
+            network.standardised(inputs) if range_ is None else range_.outputs(network, inputs)
+        )
         return np.asarray(outputs.double().cpu().numpy())
 
-    def equilibria(self, commands: FloatArray) -> tuple[torch.Tensor, FloatArray, FloatArray | None]:
+    def equilibria(
+        self, commands: FloatArray
+    ) -> tuple[torch.Tensor, FloatArray, FloatArray | None]:
         """Computes equilibria under commands (B, n); those without an equilibrium are left out.
 
         Returns:
-            Positions (S, N, 3) [m], their commands (S, n), and the network's outputs (S, c) there, if there is one.
+            Positions (S, N, 3) [m], their commands (S, n), and the network's outputs (S, c) there,
+            if there is one.
         """
         q, rests = settle_some(self.robot, len(commands), **self.keywords(commands))
         q, commands = q[rests], commands[rests.cpu().numpy()]
@@ -287,8 +321,12 @@ class Source:
         force = coder.decode(torch.as_tensor(outputs).to(coder.scale)).to(state.q)
         return force if frames is None else frames.to_world(state.q, state.v, force)
 
-    def tangent(self, q: torch.Tensor, commands: FloatArray, modes: int, outputs: FloatArray | None) -> Tangent:
-        """Linearises about an equilibrium (1, N, 3) under commands (n,) and the force of network outputs (c,)."""
+    def tangent(
+        self, q: torch.Tensor, commands: FloatArray, modes: int, outputs: FloatArray | None
+    ) -> Tangent:
+        """Linearises about an equilibrium (1, N, 3) under commands (n,)
+        and the force of network outputs (c,).
+        """
         robot, still, keywords = self.robot, torch.zeros_like(q), self.keywords(commands[None])
         state = robot.state(q, **keywords)
         hessian, inertia, free = linearised(self._elastic, state, **keywords)
@@ -296,23 +334,27 @@ class Source:
         coordinates = (3 * free[:, None] + np.arange(3)).ravel()
         mass = scipy.sparse.diags_array(self.mass.cpu().numpy()[coordinates]).tocsc()
         count = min(int(np.ceil(_MORE_MODES * modes)) + 2, inertia.shape[0] - 2)
-        values, vectors = scipy.sparse.linalg.eigsh(stiffness, count, M=mass, sigma=0.0, v0=np.ones(inertia.shape[0]))
+        values, vectors = scipy.sparse.linalg.eigsh(
+            stiffness, count, M=mass, sigma=0.0, v0=np.ones(inertia.shape[0])
+        )
         order = np.argsort(values)[:modes]
         shapes = torch.zeros(q[0].numel(), modes, dtype=torch.float64, device=q.device)
-        shapes[torch.as_tensor(coordinates, device=q.device)] = torch.as_tensor(vectors[:, order], device=q.device)
+        shapes[torch.as_tensor(coordinates, device=q.device)] = torch.as_tensor(
+            vectors[:, order], device=q.device
+        )
         modal_stiffness = np.diag(values[order])
         damped, inertia = linearised(self._viscous, state, **keywords)[:2]
         # The Hessian of a step of length s is M / s^2 + D / s + K.
         step = float(np.sqrt(mass.diagonal()[0] / inertia.diagonal()[0]))
         kept = vectors[:, order]
         damping = step * (kept.T @ ((damped - hessian) @ kept))
-        branches, gamma = (
-            np.zeros((len(self.times), *modal_stiffness.shape)),
-            relaxation(torch.tensor(self.times), robot.time_step)[1],
-        )
+        branches = np.zeros((len(self.times), *modal_stiffness.shape))
+        gamma = relaxation(torch.tensor(self.times), robot.time_step)[1]
         for number, branch in enumerate(self._branches):
             branches[number] = (
-                kept.T @ ((linearised(branch, state, **keywords)[0] - hessian) @ kept) / float(gamma[number])
+                kept.T
+                @ ((linearised(branch, state, **keywords)[0] - hessian) @ kept)
+                / float(gamma[number])
             )
         columns, zero = shapes.mT.reshape(-1, *q.shape[1:]).to(q), q.new_zeros(modes)
 
@@ -324,10 +366,15 @@ class Source:
             return Tangent(shapes, modal_stiffness, damping, shown, branches, None)
         outputs, width = outputs[None], len(outputs)
         by_q = np.zeros_like(modal_stiffness)
-        if robot.frames is not None:  # The force turns with the body after the step, so that it contributes to A.
-            pull = torch.func.jacfwd(lambda by: self._pull(State(q + _moved(by, columns), still), outputs).flatten())
+        if robot.frames is not None:
+            # The force turns with the body after the step, so that it contributes to A.
+            pull = torch.func.jacfwd(
+                lambda by: self._pull(State(q + _moved(by, columns), still), outputs).flatten()
+            )
             by_q = (shapes.mT @ pull(zero).double()).cpu().numpy()
-        unit = self._pull(State(q.expand(width, -1, -1), still.expand(width, -1, -1)), np.eye(width))
+        unit = self._pull(
+            State(q.expand(width, -1, -1), still.expand(width, -1, -1)), np.eye(width)
+        )
         zero_force = self._pull(State(q, still), np.zeros((1, width)))
         push = (shapes.mT @ (unit - zero_force).flatten(1).mT.double()).cpu().numpy()
         return Tangent(shapes, modal_stiffness - by_q, damping, shown, branches, push)

@@ -1,4 +1,6 @@
-"""Paths for a point of a robot, circles, figures of eight and letters, and the task to follow them."""
+"""Paths for a point of a robot, circles, figures of eight and letters,
+and the task to follow them.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +24,8 @@ from .sampling import driven_input
 
 _POINTS = 40  # number of points of a path whose reach is checked
 _SPACING = 0.05  # between knots of the inputs of a plan [s]
-_AHEAD, _WEIGHT, _ITERATIONS = 0.3, 1e-3, 3  # of plans of whole motions: horizon [s], weight, and iterations
+# Of plans of whole motions: horizon [s], weight, and iterations.
+_AHEAD, _WEIGHT, _ITERATIONS = 0.3, 1e-3, 3
 _CHANGE = 1e-3  # of the inputs for derivatives of an equilibrium, as a share of their ranges
 _LEAST_PIECES = 3  # of the inputs in a receding horizon
 _RESOLUTION: Final = 2000  # number of points of a path
@@ -66,7 +69,7 @@ class Path:
     size: float  # of its larger side [m]
     centre: Sequence[float]  # (3,) of its bounding box [m]
     right: Sequence[float] = (1.0, 0.0, 0.0)  # (3,) the direction of its width
-    up: Sequence[float] = (0.0, 1.0, 0.0)  # (3,) the direction of its height; made perpendicular to ``right``
+    up: Sequence[float] = (0.0, 1.0, 0.0)  # (3,) direction of its height, made perpendicular
 
     @property
     def points(self) -> FloatArray:
@@ -76,13 +79,18 @@ class Path:
             InputError: an unknown shape, a size that is not positive, or parallel directions.
         """
         if not self.size > 0.0:
-            raise InputError(f"the size of the path {self.name} is {self.size:g}: it must be positive, in m.")
+            raise InputError(
+                f"the size of the path {self.name} is {self.size:g}: it must be positive, in m."
+            )
         flat = _curve(self.name)
         low, high = flat.min(0), flat.max(0)
         flat = (flat - 0.5 * (low + high)) * (self.size / float((high - low).max()))
-        first, second = np.asarray(self.right, dtype=np.float64), np.asarray(self.up, dtype=np.float64)
+        first = np.asarray(self.right, dtype=np.float64)
+        second = np.asarray(self.up, dtype=np.float64)
         if not np.linalg.norm(np.cross(first, second)) > 1e-9:
-            raise InputError(f"right and up of the path {self.name} are parallel: give two different directions.")
+            raise InputError(
+                f"right and up of the path {self.name} are parallel: give two different directions."
+            )
         first = first / np.linalg.norm(first)
         second = second - (second @ first) * first
         second /= np.linalg.norm(second)
@@ -94,14 +102,18 @@ class Path:
         Args:
             seconds: duration of the curve.
             time_step: h [s].
-            lead: (3,) point from which it first moves to the start of the curve, in a quarter of the duration [m].
+            lead: (3,) point from which it first moves to the start of the curve, in a quarter of
+                the duration [m].
 
         Raises:
             InputError: the duration is shorter than ten steps.
         """
         steps = round(seconds / time_step)
         if steps < 10:
-            raise InputError(f"the path {self.name} takes {seconds:g} s: give at least ten steps of {time_step:g} s.")
+            raise InputError(
+                f"the path {self.name} takes {seconds:g} s: "
+                f"give at least ten steps of {time_step:g} s."
+            )
         curve = self.points
         at = _eased(np.arange(steps + 1) / steps) * (len(curve) - 1)
         points = _interpolated(at, np.arange(len(curve)), curve)
@@ -119,7 +131,9 @@ def _curve(name: str) -> FloatArray:
         return _even(np.stack([np.sin(2.0 * angle) / 2.0, np.cos(angle)], axis=1))
     if name not in _LETTERS:
         raise InputError(f"the path is {name!r}: choose circle, eight, or a capital letter.")
-    corners = np.array([[float(x) for x in (at.split(",") if "," in at else at)] for at in _LETTERS[name].split()])
+    corners = np.array(
+        [[float(x) for x in (at.split(",") if "," in at else at)] for at in _LETTERS[name].split()]
+    )
     straight = _even(corners)
     return _even(gaussian_filter1d(straight, _CORNER * _RESOLUTION / 2.0, axis=0, mode="nearest"))
 
@@ -140,7 +154,9 @@ def _smooth(share: FloatArray) -> FloatArray:
 
 
 def _eased(share: FloatArray) -> FloatArray:
-    """Progress from 0 to 1 at constant speed, except that it accelerates and decelerates in the outer tenths."""
+    """Progress from 0 to 1 at constant speed, except
+    that it accelerates and decelerates in the outer tenths.
+    """
     rate = _smooth(np.clip(10.0 * np.minimum(share, 1.0 - share), 0.0, 1.0))
     gone = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]))])
     return np.asarray(gone / gone[-1])
@@ -172,7 +188,8 @@ class Task:
         """The curves, one for each shape."""
         shown = self.figures
         return [
-            Path(name, size=shown.size, centre=shown.centre, right=shown.right, up=shown.up) for name in shown.shapes
+            Path(name, size=shown.size, centre=shown.centre, right=shown.right, up=shown.up)
+            for name in shown.shapes
         ]
 
     def steps(self, seconds: float) -> int:
@@ -198,7 +215,9 @@ class Task:
         """
         steps = max(round(horizon / self.time_step), 1)
         pieces = min(max(round(steps * self.time_step / _SPACING), _LEAST_PIECES), steps)
-        return Planner(model, self.tracked, self.figures.limits, path, steps, pieces, weight, iterations)
+        return Planner(
+            model, self.tracked, self.figures.limits, path, steps, pieces, weight, iterations
+        )
 
     def check_reach(self, model: ReducedModel, reach: float) -> None:
         """Checks that the robot has an equilibrium at every point of the paths.
@@ -219,17 +238,22 @@ class Task:
                 if distance > worst:
                     worst, shown = distance, (point, near)
             if worst > reach:
-                wanted, reached = ("(" + ", ".join(f"{1e3 * x:.1f}" for x in point) + ")" for point in shown)
+                wanted, reached = (
+                    "(" + ", ".join(f"{1e3 * x:.1f}" for x in point) + ")" for point in shown
+                )
                 raise InputError(
-                    f"the robot cannot reach the path {path.name}: the reachable point nearest to {wanted} mm is "
-                    f"{reached} mm, {1e3 * worst:.1f} mm away. Change control.centre, control.size or "
-                    "control.limits.high, or allow this distance by control.plan.reach."
+                    f"the robot cannot reach the path {path.name}: the reachable point nearest "
+                    f"to {wanted} mm is {reached} mm, {1e3 * worst:.1f} mm away. Change "
+                    "control.centre, control.size or control.limits.high, or allow this "
+                    "distance by control.plan.reach."
                 )
 
     def _nearest(
         self, model: ReducedModel, point: FloatArray, guess: FloatArray | None
     ) -> tuple[FloatArray, FloatArray]:
-        """Inputs (n,) as shares whose equilibrium is nearest to a point, and its position (3,) there [m]."""
+        """Inputs (n,) as shares whose equilibrium is nearest to a point,
+        and its position (3,) there [m].
+        """
         limits = self.figures.limits
 
         def places(shares: FloatArray) -> FloatArray:
@@ -239,9 +263,13 @@ class Task:
             moved = places(around(shares, _CHANGE))
             return 1e3 * (moved[1:] - moved[0]).T / _CHANGE
 
-        starts = [np.full(self.parts, 0.4)] + ([] if guess is None else [np.clip(guess, 0.01, 0.99)])
+        starts = [np.full(self.parts, 0.4)] + (
+            [] if guess is None else [np.clip(guess, 0.01, 0.99)]
+        )
         searches = [
-            least_squares(lambda x: 1e3 * (places(x[None])[0] - point), start, slopes, (0.0, 1.0), xtol=1e-4)
+            least_squares(
+                lambda x: 1e3 * (places(x[None])[0] - point), start, slopes, (0.0, 1.0), xtol=1e-4
+            )
             for start in starts
         ]
         best = min(searches, key=lambda search: search.cost).x
@@ -249,5 +277,11 @@ class Task:
 
 
 def motions_of(figures: FigureSettings, *durations: float) -> list[str]:
-    """Returns the names of all motions, or of those of some durations: each curve at each speed, as ``eight_4s``."""
-    return [f"{shape}_{seconds:g}s" for seconds in durations or figures.seconds for shape in figures.shapes]
+    """Returns the names of all motions, or of those of some durations:
+    each curve at each speed, as ``eight_4s``.
+    """
+    return [
+        f"{shape}_{seconds:g}s"
+        for seconds in durations or figures.seconds
+        for shape in figures.shapes
+    ]

@@ -1,4 +1,6 @@
-"""Simulated bodies that are commanded and observed step by step: robots, reduced models, the simulated laboratory."""
+"""Simulated bodies that are commanded and observed step by step:
+robots, reduced models, the simulated laboratory.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -32,7 +34,9 @@ from ..stepping.rollout import states
 from ..stepping.state import State
 from .reduced_model import ReducedModel, ReducedState
 
-_FURTHEST: Final = 20.0  # coordinates at which a reduced model has failed, relative to those of equilibria
+_FURTHEST: Final = (
+    20.0  # coordinates at which a reduced model has failed, relative to those of equilibria
+)
 _LEAST: Final = 1e-3  # lower bound of drawn positive parameters, relative to the identified value
 _STREAM: Final = 7  # of the random number generator
 _BEFORE: Final = 1_000_000  # number of the first of the frames taken before the first step
@@ -54,12 +58,17 @@ class World(ABC, Generic[S]):
     time_step: float  # h [s]
     input: str  # name of the commanded input
     parts: int  # number n of its values
-    noise: float | None = None  # standard deviation of observed markers [m]; None if the caller chooses it
-    travel: tuple[float, float, float] = (0.0, 0.0, 0.0)  # (3,) way by which commands may move a body as a whole [m]
+    noise: float | None = (
+        None  # standard deviation of observed markers [m]; None if the caller chooses it
+    )
+    travel: tuple[float, float, float] = (0.0, 0.0, 0.0)  # (3,) of the body as a whole [m]
 
     @abstractmethod
     def step(self, state: S, commands: FloatArray) -> S:
-        """Returns the state after one time step under commands (B, n); bodies that fail are lost, and stand at rest."""
+        """Returns the state after one time step under commands (B, n).
+
+        Bodies that fail are lost, and stand at rest.
+        """
 
     @abstractmethod
     def markers(self, state: S) -> FloatArray:
@@ -71,15 +80,21 @@ class World(ABC, Generic[S]):
         return np.asarray(torch.as_tensor(moving.lost).cpu().numpy())
 
     def forces(self, state: S) -> FloatArray:
-        """Forces (B, K) that hold the bodies at their fixed vertices over a weight; zero where no step led to a state.
+        """Forces (B, K) that hold the bodies at their fixed vertices over a weight.
+
+        Zero where no step led to a state.
 
         Raises:
             InputError: nothing in this world knows them.
         """
-        raise InputError("forces need a simulator and fixed vertices: choose another world or robot.")
+        raise InputError(
+            "forces need a simulator and fixed vertices: choose another world or robot."
+        )
 
     def squeeze(self, state: S) -> FloatArray:
-        """Forces (B,) of fingers beyond the least that holds a ball, over its weight, or raises InputError."""
+        """Forces (B,) of fingers beyond the least that holds a ball,
+        over its weight, or raises InputError.
+        """
         raise InputError("squeeze is for fingers that hold a ball: choose grasp or pick_and_place.")
 
     def vary(self, random: Sequence[np.random.Generator]) -> None:
@@ -87,11 +102,16 @@ class World(ABC, Generic[S]):
         del random
 
     def bodies(self, state: S) -> tuple[IntArray, FloatArray]:
-        """Surface triangles (S, 3) and vertices (B, N, 3) [m]; empty if the body is known by its markers only."""
+        """Surface triangles (S, 3) and vertices (B, N, 3) [m].
+
+        Empty if the body is known by its markers only.
+        """
         return np.zeros((0, 3), dtype=np.int64), np.zeros((self.count, 0, 3))
 
     def rigid(self, state: S) -> tuple[IntArray, FloatArray]:
-        """Surface triangles (S, 3) and vertices (B, N, 3) of rigid bodies that carry the others [m]; empty if none."""
+        """Surface triangles (S, 3) and vertices (B, N, 3) of rigid bodies
+        that carry the others [m]; empty if none.
+        """
         del state
         return np.zeros((0, 3), dtype=np.int64), np.zeros((self.count, 0, 3))
 
@@ -101,10 +121,15 @@ class World(ABC, Generic[S]):
 
 
 def total_force(simulator: Simulator, state: State, at: str | None = None) -> FloatArray:
-    """Returns the force (B, 3) on fixed vertices, of a body of a scene if it is named [N]; zero where it is unknown."""
+    """Returns the force (B, 3) on fixed vertices, of a body of a scene if it is named [N].
+
+    Zero where it is unknown.
+    """
     if state.reaction is None:
         return np.zeros((state.batch, 3))
-    return np.nan_to_num(simulator.reaction(state, at or simulator.fixed).force.detach().double().cpu().numpy())
+    return np.nan_to_num(
+        simulator.reaction(state, at or simulator.fixed).force.detach().double().cpu().numpy()
+    )
 
 
 class RobotWorld(World[State]):
@@ -114,7 +139,8 @@ class RobotWorld(World[State]):
         robot: loaded with ``on_failure="count"``.
         command: name of the commanded input.
         count: B.
-        spread: variation of the parameters, in standard deviations of their identification; 0 for none.
+        spread: variation of the parameters, in standard deviations of their identification; 0 for
+            none.
         mixed: (k, n) from k commands to the n values of the input; the identity if omitted.
         shown: numbers of the observed points among all markers or vertices; all if omitted.
         time_step: h [s], a multiple of the robot's; that of the robot if omitted.
@@ -134,11 +160,13 @@ class RobotWorld(World[State]):
         time_step: float | None = None,
     ) -> None:
         if command not in robot.inputs:
-            raise InputError(f"there is no input {command!r}: the robot has {', '.join(robot.inputs) or 'none'}.")
+            raise InputError(
+                f"there is no input {command!r}: the robot has {', '.join(robot.inputs) or 'none'}."
+            )
         if spread > 0.0 and robot.description.uncertainty is None:
             raise InputError(
-                f"{robot.description.name} has no standard deviations of its parameters, which spread needs: set "
-                "spread=0, or choose a run that identifies parameters."
+                f"{robot.description.name} has no standard deviations of its parameters, which "
+                "spread needs: set spread=0, or choose a run that identifies parameters."
             )
         self._nominal = self.robot = robot
         self.count, self.time_step, self.input = count, time_step or robot.time_step, command
@@ -163,7 +191,9 @@ class RobotWorld(World[State]):
         if "poissons_ratio" in parameters:
             parameters["poissons_ratio"] = parameters["poissons_ratio"].clip(0.0, 0.499)
         tensor = self._nominal.simulator.tensor
-        self.robot = self._nominal.with_parameters(**{name: tensor(values) for name, values in parameters.items()})
+        self.robot = self._nominal.with_parameters(
+            **{name: tensor(values) for name, values in parameters.items()}
+        )
         self.rest = self._begun()
 
     def _begun(self) -> State:
@@ -174,7 +204,9 @@ class RobotWorld(World[State]):
     @torch.no_grad()
     def step(self, state: State, commands: FloatArray) -> State:
         inputs = {self.input: commands @ self._mixed}
-        *_, state = states(lambda now, _: self.robot.step(now, **inputs), state, range(self._substeps))
+        *_, state = states(
+            lambda now, _: self.robot.step(now, **inputs), state, range(self._substeps)
+        )
         return state
 
     @override
@@ -199,7 +231,9 @@ class RobotWorld(World[State]):
         return ObstacleSurface.of(self.robot.simulator.body, self._nominal.parameters)
 
 
-def laboratory_robot(settings: StageSettings, upright: bool = False, on_failure: str = "raise") -> Robot:
+def laboratory_robot(
+    settings: StageSettings, upright: bool = False, on_failure: str = "raise"
+) -> Robot:
     """Returns the simulated laboratory of a run as a robot with its own markers.
 
     Args:
@@ -229,35 +263,51 @@ def laboratory_settings(folder: Path) -> StageSettings:
     Raises:
         DataFileError: the run has no laboratory, or is unfinished.
     """
-    return parse(StageSettings, finished_record(folder, _LABORATORY)["settings"]).model_copy(update={"device": "cpu"})
+    return parse(StageSettings, finished_record(folder, _LABORATORY)["settings"]).model_copy(
+        update={"device": "cpu"}
+    )
 
 
 class Laboratory(RobotWorld):
-    """Bodies that stand in for the real robot: they take commands step by step, and cameras see their markers.
+    """Bodies that stand in for the real robot: they take commands step by step,
+    and cameras see their markers.
 
     Args:
         settings: of the laboratory.
-        run_dir: of its run; the registration there gives the pose of the body in the cameras' frame.
+        run_dir: of its run; the registration there gives the pose of the body in the cameras'
+            frame.
         name: of the input.
         count: B.
         seed: of the noise.
-        on_failure: ``raise``; or ``count``: a body whose simulation fails stays at rest until it begins again.
+        on_failure: ``raise``; or ``count``: a body whose simulation fails stays at rest until it
+            begins again.
     """
 
     noise: float
 
     def __init__(
-        self, settings: StageSettings, run_dir: Path, name: str, count: int, seed: int, on_failure: str = "raise"
+        self,
+        settings: StageSettings,
+        run_dir: Path,
+        name: str,
+        count: int,
+        seed: int,
+        on_failure: str = "raise",
     ) -> None:
         substeps_of(settings.time_step, settings.laboratory, _LABORATORY)
         robot = laboratory_robot(settings, on_failure=on_failure)
         super().__init__(robot, name, count, time_step=settings.time_step)
         self.noise = settings.laboratory.noise
         self._seeds = (settings.seed, _STREAM, seed)
-        trials, reference = read_json(run_dir / REGISTRATION).values(), make_setup(settings).reference
+        trials = read_json(run_dir / REGISTRATION).values()
+        reference = make_setup(settings).reference
         seen = [trial["positions"] for trial in trials if "positions" in trial]
-        places = np.mean([[places_of[label] for label in settings.binding.reference] for places_of in seen], axis=0)
-        self._frame = kabsch(reference, places)  # from the frame of the body to that of the experiment
+        places = np.mean(
+            [[places_of[label] for label in settings.binding.reference] for places_of in seen],
+            axis=0,
+        )
+        # From the frame of the body to that of the experiment.
+        self._frame = kabsch(reference, places)
 
     @override
     def markers(self, state: State) -> FloatArray:
@@ -277,14 +327,19 @@ class Laboratory(RobotWorld):
         return super().obstacles().carried(self._frame.rotation, self._frame.translation)
 
     def seen(self, state: State, number: int) -> FloatArray:
-        """Returns noisy markers (B, M, 3) after a number of steps [m]; the step number seeds the noise."""
+        """Returns noisy markers (B, M, 3) after a number of steps [m].
+
+        The step number seeds the noise.
+        """
         markers = self.markers(state)
         random = np.random.default_rng([*self._seeds, number])
         return markers + self.noise * random.standard_normal(markers.shape)
 
     def seen_at_rest(self, frames: int = 20) -> FloatArray:
         """Returns noisy markers (B, M, 3) averaged over frames taken before anything moves [m]."""
-        return np.asarray(np.mean([self.seen(self.rest, _BEFORE + number) for number in range(frames)], axis=0))
+        return np.asarray(
+            np.mean([self.seen(self.rest, _BEFORE + number) for number in range(frames)], axis=0)
+        )
 
 
 class ReducedWorld(World[ReducedState]):

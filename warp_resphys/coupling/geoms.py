@@ -21,7 +21,11 @@ class GeomSurfaces:
     """
 
     def __init__(self, model: Any) -> None:
-        self._points, triangles, first = dict[int, FloatArray](), [np.zeros((0, 3), dtype=np.int64)], 0
+        self._points, triangles, first = (
+            dict[int, FloatArray](),
+            [np.zeros((0, 3), dtype=np.int64)],
+            0,
+        )
         for geom, size in enumerate(model.geom_size):
             solid = _solid(int(model.geom_type[geom]), *size)
             if solid is not None:
@@ -31,9 +35,11 @@ class GeomSurfaces:
         self.triangles: IntArray = np.concatenate(triangles)
 
     def points(self, data: Any) -> FloatArray:
-        """Returns the corners (P, 3) of the surfaces where the geoms are in a `mujoco.MjData` [m]."""
+        """Returns the corners (P, 3) of surfaces where the geoms are in a `mujoco.MjData` [m]."""
         turns, places = data.geom_xmat.reshape(-1, 3, 3), data.geom_xpos
-        return np.concatenate([x @ turns[geom].T + places[geom] for geom, x in self._points.items()])
+        return np.concatenate(
+            [x @ turns[geom].T + places[geom] for geom, x in self._points.items()]
+        )
 
 
 def _solid(kind: int, x: float, y: float, z: float) -> Any:

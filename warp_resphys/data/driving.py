@@ -17,8 +17,8 @@ _RISE: Final = 0.5  # s after inputs grew
 def time_since_change(times: FloatArray, inputs: Sequence[FloatArray]) -> FloatArray:
     """Returns the times since the last change of the inputs of B trials [s]; infinite for poses.
 
-    An input changes where it leaves the value that it took at its last change by more than 2 % of its largest size in
-    the trial, so that noise is no change. The first frame counts as one.
+    An input changes where it leaves the value that it took at its last change by more than 2 % of
+    its largest size in the trial, so that noise is no change. The first frame counts as one.
 
     Args:
         times: (T, B) [s]; a trial of one frame is a pose.
@@ -37,11 +37,15 @@ def time_since_change(times: FloatArray, inputs: Sequence[FloatArray]) -> FloatA
     return np.asarray(times - last)
 
 
-def phases(since: NDArray[np.float64], sizes: NDArray[np.float64], before: float = 0.0) -> NDArray[np.str_]:
-    """Returns the phase of each frame of a driven trial: ``rise``, ``hold`` or ``release``; empty before any.
+def phases(
+    since: NDArray[np.float64], sizes: NDArray[np.float64], before: float = 0.0
+) -> NDArray[np.str_]:
+    """Returns the phase of each frame of a driven trial: ``rise``, ``hold`` or ``release``.
 
-    After its inputs grew, a trial rises for half a second and then holds; after they fell, it is released until they
-    grow again. Differences of up to 2 % of the largest size are noise.
+    Empty before any.
+
+    After its inputs grew, a trial rises for half a second and then holds; after they fell, it is
+    released until they grow again. Differences of up to 2 % of the largest size are noise.
 
     Args:
         since: (T,) since the last change of the norm [s], see `time_since_change`.
@@ -57,7 +61,10 @@ def phases(since: NDArray[np.float64], sizes: NDArray[np.float64], before: float
 
 
 def driving(trials: Trials, names: Sequence[str]) -> dict[str, FloatArray]:
-    """Returns what acts during each frame, (R, T, C) by input, base and obstacle; a pose has the last values."""
+    """Returns what acts during each frame, (R, T, C) by input, base and obstacle.
+
+    A pose has the last values.
+    """
     rows = trials.rows(names)
     series = {name: values[rows] for name, values in trials.inputs.items()}
     series |= {} if trials.base is None else {"base": trials.base[rows]}
@@ -81,18 +88,26 @@ def since_change(trials: Trials, names: Sequence[str]) -> FloatArray:
 
 
 def first_change(trials: Trials, name: str) -> float:
-    """Returns the time at which the inputs of a trial begin to change by more than noise [s]; zero if none does."""
-    changes = np.flatnonzero(since_change(trials, [name])[0] == 0.0)  # The first frame counts as one.
+    """Returns the time at which the inputs of a trial begin to change by more than noise [s].
+
+    Zero if none does.
+    """
+    # The first frame counts as one.
+    changes = np.flatnonzero(since_change(trials, [name])[0] == 0.0)
     return float(trials.times[trials.rows([name])[0], changes[1]]) if len(changes) > 1 else 0.0
 
 
 def phases_of(trials: Trials, names: Sequence[str]) -> NDArray[np.str_]:
-    """Returns the phases (R, T) of driven trials, see `phases`; empty words for others and for poses.
+    """Returns the phases (R, T) of driven trials, see `phases`.
+
+    Empty words for others and for poses.
 
     The size of the inputs is their norm, each kind over its largest value.
     """
     rows, acting = trials.rows(names), driving(trials, names)
-    largest = {name: float(np.abs(values).max(initial=0.0)) for name, values in trials.inputs.items()}
+    largest = {
+        name: float(np.abs(values).max(initial=0.0)) for name, values in trials.inputs.items()
+    }
     kinds = {name: acting[name] / size for name, size in largest.items() if size}
     found = np.full(trials.times[rows].shape, "", dtype="<U7")
     if not kinds:
@@ -101,6 +116,12 @@ def phases_of(trials: Trials, names: Sequence[str]) -> NDArray[np.str_]:
     since = time_since_change(trials.times[rows].T, [sizes.T[..., None]]).T
     for k, row in enumerate(rows):
         if trials.begins[row] != STATIC:
-            before = [trials.resting[name][row] / largest[name] for name in kinds if name in trials.resting]
-            found[k] = phases(since[k], sizes[k], float(np.linalg.norm(np.concatenate([[0.0], *before]))))
+            before = [
+                trials.resting[name][row] / largest[name]
+                for name in kinds
+                if name in trials.resting
+            ]
+            found[k] = phases(
+                since[k], sizes[k], float(np.linalg.norm(np.concatenate([[0.0], *before])))
+            )
     return found

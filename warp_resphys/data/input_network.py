@@ -10,25 +10,29 @@ Array = Any  # of NumPy or torch
 
 _LEAST_DISTANCE: Final = 1e-3  # between centres, of the largest input
 _LEAST_VARIANCE: Final = 1e-3  # of a value in the training, of the square of the largest input
-_REACH: Final = 2.0  # square of the Mahalanobis distance over the largest one of the training, from which it fades
+# Square of the Mahalanobis distance over the largest one of the training, from which it fades.
+_REACH: Final = 2.0
 _JITTER: Final = 1e-6  # added to the variance of the process, 1, at the centres
 
 
 class InputNetwork(torch.nn.Module):
     """The change of an input (C,) of a body beyond its identified response x: f(x, means of x).
 
-    f is the mean of Gaussian processes, one for each part, that are zero under no input: inputs that have long been
-    zero are not changed. Their kernel k(a, b) = exp(-|a - b|^2 / 2) has the largest input of the training as its unit.
-    f is a sum of k about N centres (Rasmussen and Williams 2006, section 8.3.1). It starts as zero. Away from the
-    values of the training, it fades with the Mahalanobis distance d from their mean, by min(1, 2 d_max^2 / d^2).
+    f is the mean of Gaussian processes, one for each part, that are zero under no input: inputs
+    that have long been zero are not changed. Their kernel k(a, b) = exp(-|a - b|^2 / 2) has the
+    largest input of the training as its unit. f is a sum of k about N centres (Rasmussen and
+    Williams 2006, section 8.3.1). It starts as zero. Away from the values of the training, it fades
+    with the Mahalanobis distance d from their mean, by min(1, 2 d_max^2 / d^2).
 
     Args:
         filters: F time constants of the exponential means [s].
         unit: largest input [unit of the input].
         centres: (N, C (1 + F)) inputs and means, over the unit.
         mean: (C (1 + F),) of the training, over the unit.
-        precision: (C (1 + F), C (1 + F)) inverse covariance over 2 d_max^2, twice the largest d^2 of the training.
-        basis: (N, N) functions with which weights of unit variance give the process, from kernels about the centres.
+        precision: (C (1 + F), C (1 + F)) inverse covariance over 2 d_max^2, twice the largest d^2
+            of the training.
+        basis: (N, N) functions with which weights of unit variance give the process, from kernels
+            about the centres.
     """
 
     def __init__(
@@ -41,8 +45,17 @@ class InputNetwork(torch.nn.Module):
         basis: torch.Tensor,
     ) -> None:
         super().__init__()
-        self.filters, self.unit, self.parts = tuple(filters), unit, centres.shape[1] // (1 + len(filters))
-        for name, x in {"centres": centres, "mean": mean, "precision": precision, "basis": basis}.items():
+        self.filters, self.unit, self.parts = (
+            tuple(filters),
+            unit,
+            centres.shape[1] // (1 + len(filters)),
+        )
+        for name, x in {
+            "centres": centres,
+            "mean": mean,
+            "precision": precision,
+            "basis": basis,
+        }.items():
             self.register_buffer(name, x.double())
         self.weights = torch.nn.Parameter(self.basis.new_zeros(len(centres), self.parts))
 
@@ -77,39 +90,62 @@ class InputNetwork(torch.nn.Module):
         return cls(filters, unit, centres, values.mean(0), precision, basis)
 
     def forward(self, values: torch.Tensor) -> torch.Tensor:
-        """Returns what is added to an input (..., C), for the input and its means (..., C (1 + F))."""
+        """Returns what is added to an input (..., C),
+        for the input and its means (..., C (1 + F)).
+        """
         x = values.to(self.centres) / self.unit
         away = x - self.mean
         beyond = ((away @ self.precision) * away).sum(-1, keepdim=True).clamp_min(1.0)
-        return (self.unit / beyond * (_kernel(x, self.centres) @ (self.basis @ self.weights))).to(values)
+        return (self.unit / beyond * (_kernel(x, self.centres) @ (self.basis @ self.weights))).to(
+            values
+        )
 
     def added(self, values: Array) -> Array:
         """Returns what is added, as `forward`, for NumPy arrays, too."""
         if isinstance(values, torch.Tensor):
             return self(values)
         with torch.no_grad():
-            return self(torch.as_tensor(np.asarray(values), device=self.centres.device)).cpu().numpy()
+            return (
+                self(torch.as_tensor(np.asarray(values), device=self.centres.device)).cpu().numpy()
+            )
 
     def plain(self) -> dict[str, Any]:
         """Returns all that defines the network as plain data."""
         values = {"centres": self.centres, "mean": self.mean, "precision": self.precision}
         values |= {"coefficients": (self.basis @ self.weights).detach()}
-        return {"filters": [*self.filters], "unit": self.unit, **{name: x.tolist() for name, x in values.items()}}
+        return {
+            "filters": [*self.filters],
+            "unit": self.unit,
+            **{name: x.tolist() for name, x in values.items()},
+        }
 
     @classmethod
     def of_plain(cls, plain: Mapping[str, Any]) -> Self:
         """Returns the network of `plain`."""
-        tensors = {name: torch.tensor(x, dtype=torch.float64) for name, x in plain.items() if isinstance(x, list)}
+        tensors = {
+            name: torch.tensor(x, dtype=torch.float64)
+            for name, x in plain.items()
+            if isinstance(x, list)
+        }
         coefficients, filters = tensors.pop("coefficients"), tensors.pop("filters").tolist()
-        network = cls(filters, plain["unit"], **tensors, basis=torch.eye(len(coefficients), dtype=torch.float64))
+        network = cls(
+            filters,
+            plain["unit"],
+            **tensors,
+            basis=torch.eye(len(coefficients), dtype=torch.float64),
+        )
         network.load_state_dict({**network.state_dict(), "weights": coefficients})
         return network.eval().requires_grad_(False)
 
 
 def _kernel(x: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
-    """(..., N) covariance of values (..., P) and centres (N, P) of a process of unit variance that is zero at zero."""
+    """(..., N) covariance of values (..., P) and centres (N, P)
+    of a process of unit variance that is zero at zero.
+    """
     squares, of_centres = x.square().sum(-1, keepdim=True), centres.square().sum(-1)
-    return torch.exp(x @ centres.T - 0.5 * (squares + of_centres)) - torch.exp(-0.5 * (squares + of_centres))
+    return torch.exp(x @ centres.T - 0.5 * (squares + of_centres)) - torch.exp(
+        -0.5 * (squares + of_centres)
+    )
 
 
 class Actuator(torch.nn.Module):

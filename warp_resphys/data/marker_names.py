@@ -1,8 +1,9 @@
 """Names of markers by their places.
 
-Markers without names are matched with their nominal places by the motion and the pairs with the least sum of squares.
-The best pairs for a motion are those of the Hungarian method (Kuhn, Naval Research Logistics Quarterly 2 (1955) 83);
-the candidate motions carry a few markers, the anchors, onto their nominal places. Points are (M, 3) [m].
+Markers without names are matched with their nominal places by the motion and the pairs with the
+least sum of squares. The best pairs for a motion are those of the Hungarian method (Kuhn, Naval
+Research Logistics Quarterly 2 (1955) 83); the candidate motions carry a few markers, the anchors,
+onto their nominal places. Points are (M, 3) [m].
 """
 
 from collections.abc import Iterator, Sequence
@@ -35,51 +36,66 @@ def assign(
     """Assigns names to measured markers.
 
     Args:
-        seen: (S, 3) measured markers in the frame of the recording [m], NaN for one that was not seen; markers in
-            excess of the names stay without a name.
+        seen: (S, 3) measured markers in the frame of the recording [m], NaN for one that was not
+            seen; markers in excess of the names stay without a name.
         expected: (M, 3) nominal places of the named markers, in the frame of the body [m].
         names: M names.
         source: of the recording, for messages.
-        anchors: indices of the names at their nominal places, which determine the motion: those on the clamp, for a
-            bent body; all if None.
-        rotation: (3, 3) from the frame of the recording to that of the body, where known. Then one anchor is enough;
-            otherwise it takes three that are not on a line.
+        anchors: indices of the names at their nominal places, which determine the motion: those on
+            the clamp, for a bent body; all if None.
+        rotation: (3, 3) from the frame of the recording to that of the body, where known. Then one
+            anchor is enough; otherwise it takes three that are not on a line.
 
     Returns:
-        The index of the measured marker of every name (M,), the motion from the frame of the recording to that of the
-        body, and the root mean square distances of the pairs and of the next best ones [m].
+        The index of the measured marker of every name (M,), the motion from the frame of the
+        recording to that of the body, and the root mean square distances of the pairs and of the
+        next best ones [m].
 
     Raises:
         InputError: arrays of wrong shapes, or too few anchors.
         DataFileError: fewer markers than names, or other pairs with a similar residual.
     """
     points, places = np.asarray(seen, dtype=np.float64), np.asarray(expected, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or places.shape != (len(names), 3) or not np.isfinite(places).all():
+    if (
+        points.ndim != 2
+        or points.shape[1] != 3
+        or places.shape != (len(names), 3)
+        or not np.isfinite(places).all()
+    ):
         raise InputError(
-            f"{len(names)} markers are named, with places {places.shape} and {points.shape} seen: both must be "
-            "(markers, 3), and the places finite."
+            f"{len(names)} markers are named, with places {places.shape} and {points.shape} "
+            "seen: both must be (markers, 3), and the places finite."
         )
     visible = np.flatnonzero(np.isfinite(points).all(axis=1))
     if len(visible) < len(names):
         raise DataFileError(
-            f"{source} shows {len(visible)} markers, and {len(names)} are configured ({listed(names)}): leave out "
-            "of the configuration those that it does not have."
+            f"{source} shows {len(visible)} markers, and {len(names)} are configured "
+            f"({listed(names)}): leave out of the configuration those that it does not have."
         )
     fits = _assignments(
-        points[visible], places, np.arange(len(names)) if anchors is None else np.array(anchors), rotation
+        points[visible],
+        places,
+        np.arange(len(names)) if anchors is None else np.array(anchors),
+        rotation,
     )
     if not fits:
-        raise DataFileError(f"{source}: no three of its markers stand as those of the configuration do: check these.")
+        raise DataFileError(
+            f"{source}: no three of its markers stand as those "
+            "of the configuration do: check these."
+        )
     (rms, best, motion), *others = fits
     next_rms = others[0][0] if others else np.inf
     if next_rms < _CLEAR * max(rms, _LEAST):
         moved = [name for name, a, b in zip(names, best, others[0][1], strict=True) if a != b]
         by_column = dict(zip(visible[list(best)].tolist(), names, strict=True))
-        labels = [by_column.get(column, f"other_{column + 1}") for column in range(len(np.asarray(seen)))]
+        labels = [
+            by_column.get(column, f"other_{column + 1}") for column in range(len(np.asarray(seen)))
+        ]
         raise DataFileError(
-            f"{source}: which of its markers is which is not clear: they fit to {_MILLI * rms:.1f} mm, and to "
-            f"{_MILLI * next_rms:.1f} mm with {listed(moved)} taken for others; correct their places in the "
-            f"configuration or, if the first is right, give the recording labels: [{', '.join(labels)}]."
+            f"{source}: which of its markers is which is not clear: they fit to "
+            f"{_MILLI * rms:.1f} mm, and to {_MILLI * next_rms:.1f} mm with {listed(moved)} "
+            "taken for others; correct their places in the configuration or, if the first is "
+            f"right, give the recording labels: [{', '.join(labels)}]."
         )
     return visible[list(best)], motion, rms, next_rms
 
@@ -87,7 +103,9 @@ def assign(
 def _assignments(
     points: FloatArray, places: FloatArray, anchors: IntArray, rotation: FloatArray | None
 ) -> list[tuple[float, tuple[int, ...], RigidTransform]]:
-    """Returns pairs by the indices of the points, with root mean square distance and motion, the best ones first."""
+    """Returns pairs by the indices of the points, with root mean square distance
+    and motion, the best ones first.
+    """
     fits: dict[tuple[int, ...], tuple[float, RigidTransform]] = {}
     for motion in _motions(points, places, anchors, rotation):
         pairs = _pairs(motion.apply(points), places)
@@ -100,7 +118,9 @@ def _assignments(
             residual = root_mean_square(motion.apply(points[candidate]) - places)
             if tuple(candidate) not in fits or residual < fits[tuple(candidate)][0]:
                 fits[tuple(candidate)] = residual, motion
-    return sorted(((rms, pairs, motion) for pairs, (rms, motion) in fits.items()), key=lambda fit: fit[0])
+    return sorted(
+        ((rms, pairs, motion) for pairs, (rms, motion) in fits.items()), key=lambda fit: fit[0]
+    )
 
 
 def _motions(
@@ -108,17 +128,22 @@ def _motions(
 ) -> Iterator[RigidTransform]:
     """Motions that carry one marker, if the rotation is known, or three markers onto anchors."""
     if not len(anchors):
-        raise InputError("markers are named by those that stand still: configure one at least (markers.reference).")
+        raise InputError(
+            "markers are named by those that stand still: configure one at least "
+            "(markers.reference)."
+        )
     if rotation is not None:
         for point in points:
             yield RigidTransform(rotation, places[anchors[0]] - rotation @ point)
         return
     if len(anchors) < 3:
         raise InputError(
-            f"{len(anchors)} markers stand still, and it takes three to find how the recording is turned: configure "
-            "more (markers.reference), or data.axes."
+            f"{len(anchors)} markers stand still, and it takes three to find how the recording "
+            "is turned: configure more (markers.reference), or data.axes."
         )
-    corners = np.array(max(permutations(anchors.tolist(), 3), key=lambda three: _area(places[list(three)])))
+    corners = np.array(
+        max(permutations(anchors.tolist(), 3), key=lambda three: _area(places[list(three)]))
+    )
     wanted = places[corners]
     for three in permutations(range(len(points)), 3):
         motion, on_a_line = fit(points[list(three)], wanted, np.ones(3))

@@ -1,18 +1,21 @@
-r"""Observations, such as markers: differentiable maps from the vertices of a body to M measured points.
+r"""Observations, such as markers: differentiable maps from vertices of a body to M measured points.
 
-An observation predicts the measurement of a sensor from positions, and gives the residual of a measurement. The
-simulator is compared with recordings by these two alone, in `learning.replay`, so that a new kind of sensor is one
-class.
+An observation predicts the measurement of a sensor from positions, and gives the residual of a
+measurement. The simulator is compared with recordings by these two alone, in `learning.replay`, so
+that a new kind of sensor is one class.
 
 A marker stands on a stem. The motion of the stem depends on the kind of binding:
 
-- ``normal``: x = sum b_i q_i + d n. The stem is along the normal n of the deformed surface triangle, of constant
-  length d; the b_i sum to one and say where in the triangle's plane it stands.
-- ``frame``: x = sum b_i q_i + R o. It stands on the closest point of the surface and rotates with the triangle: R is
-  the rotation of its tangent plane that is closest to the deformation (the polar factor).
-- ``rigid``: x = c + R o. It follows the rigid motion that is closest to that of a set of vertices, such as those of a
-  face that it is glued to; c is their centre.
-- ``patch``: like ``rigid``, with the vertices around its foot, such as for a marker on a clip around a rod.
+- ``normal``: x = sum b_i q_i + d n. The stem is along the normal n of the deformed surface
+  triangle, of constant length d; the b_i sum to one and say where in the triangle's plane it
+  stands.
+- ``frame``: x = sum b_i q_i + R o. It stands on the closest point of the surface and rotates with
+  the triangle: R is the rotation of its tangent plane that is closest to the deformation
+  (the polar factor).
+- ``rigid``: x = c + R o. It follows the rigid motion that is closest to that of a set of vertices,
+  such as those of a face that it is glued to; c is their centre.
+- ``patch``: like ``rigid``, with the vertices around its foot, such as for a marker on a clip
+  around a rod.
 
 All reproduce the markers at rest, and carry them rigidly where the body moves rigidly.
 """
@@ -52,28 +55,38 @@ class Observation(Brief, ABC):
 
     @abstractmethod
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
-        """Returns the predicted measurement (B, M, D) [unit] at positions (B, N, 3) of the vertices [m].
+        """Returns the predicted measurement (B, M, D) [unit]
+        at positions (B, N, 3) of the vertices [m].
 
         The B bodies may be several trials, sets of parameters and times; all are observed alike.
         """
 
     def residual(self, predicted: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
-        """Returns predicted less measured points, (..., M, D) [unit], zero where a point was not measured (NaN)."""
+        """Returns predicted less measured points, (..., M, D) [unit],
+        zero where a point was not measured (NaN).
+        """
         seen = torch.isfinite(measured).all(-1, keepdim=True)
         return torch.where(seen, predicted - measured, 0.0)
 
     def transposed_jacobian(self, positions: torch.Tensor) -> torch.Tensor:
-        """Returns the transposed derivative (B, 3 N, D M) of the predicted measurement by positions (B, N, 3)."""
+        """Returns the transposed derivative (B, 3 N, D M) of the predicted measurement
+        by positions (B, N, 3).
+        """
         with torch.enable_grad():
             q = positions.detach().requires_grad_(True)
             points = self(q)
-            seeds = torch.eye(points[0].numel(), device=q.device, dtype=q.dtype).view(-1, 1, *points.shape[1:])
-            (rows,) = torch.autograd.grad(points, q, seeds.expand(-1, *points.shape), is_grads_batched=True)
+            seeds = torch.eye(points[0].numel(), device=q.device, dtype=q.dtype).view(
+                -1, 1, *points.shape[1:]
+            )
+            (rows,) = torch.autograd.grad(
+                points, q, seeds.expand(-1, *points.shape), is_grads_batched=True
+            )
         return rows.flatten(2).permute(1, 2, 0).contiguous()
 
     def to(self, like: torch.Tensor) -> Self:
         """Returns the observation on the device and in the precision of a tensor."""
-        changed: dict[str, Any] = {item.name: _to(getattr(self, item.name), like) for item in fields(self)}  # type: ignore[arg-type]
+        names = [item.name for item in fields(self)]  # type: ignore[arg-type]
+        changed: dict[str, Any] = {name: _to(getattr(self, name), like) for name in names}
         return replace(self, **changed)  # type: ignore[type-var]
 
 
@@ -119,7 +132,8 @@ class Markers(Observation):
 
     @classmethod
     def bind(cls, mesh: Mesh, places: NDArray[np.float64], labels: Sequence[str]) -> "Markers":
-        """Returns markers at places (m, 3) on the undeformed body [m], for classes that a configuration names.
+        """Returns markers at places (m, 3) on the undeformed body [m],
+        for classes that a configuration names.
 
         Args:
             mesh: of the body.
@@ -129,7 +143,10 @@ class Markers(Observation):
         Raises:
             InputError: the class cannot be used in a configuration.
         """
-        raise InputError(f"{cls.__name__} has no class method bind(mesh, places, labels), which makes it: add it.")
+        raise InputError(
+            f"{cls.__name__} has no class method bind(mesh, places, labels), "
+            "which makes it: add it."
+        )
 
     def moved(self, by: torch.Tensor) -> "Markers":
         """Returns the markers with an offset on the body.
@@ -140,7 +157,9 @@ class Markers(Observation):
         Raises:
             InputError: the observed points are vertices.
         """
-        raise InputError("observed vertices are where they are: only markers on stems can be placed elsewhere.")
+        raise InputError(
+            "observed vertices are where they are: only markers on stems can be placed elsewhere."
+        )
 
 
 @dataclass(frozen=True)
@@ -156,10 +175,15 @@ class MarkerMap(Markers):
         Raises:
             InputError: they do not agree, or there is no marker.
         """
-        if self.vertices.ndim != 3 or self.vertices.shape != self.weights.shape or not self.vertices.numel():
+        if (
+            self.vertices.ndim != 3
+            or self.vertices.shape != self.weights.shape
+            or not self.vertices.numel()
+        ):
             raise InputError(
                 f"marker vertices of shape {tuple(self.vertices.shape)} with weights of shape "
-                f"{tuple(self.weights.shape)}: both must be (environments, markers, vertices a marker)."
+                f"{tuple(self.weights.shape)}: both must be (environments, markers, vertices a "
+                "marker)."
             )
 
     @classmethod
@@ -169,7 +193,7 @@ class MarkerMap(Markers):
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
-        """Applies C: maps values at the vertices (B, N, ...) to values at the markers (B, m, ...)."""
+        """Applies C: maps values at the vertices (B, N, ...) to values at markers (B, m, ...)."""
         batch = torch.arange(len(positions), device=positions.device)[:, None, None]
         weights = self.weights.reshape(*self.weights.shape, *[1] * (positions.ndim - 2))
         return (positions[batch, self.vertices] * weights).sum(2)
@@ -185,18 +209,24 @@ class MarkerMap(Markers):
 
 @dataclass(frozen=True)
 class SurfaceMarkers(Markers):
-    """Markers that stand on triangles of the surface; kinds ``normal`` and ``frame`` (see the module)."""
+    """Markers that stand on triangles of the surface.
+
+    Kinds ``normal`` and ``frame`` (see the module).
+    """
 
     vertices: torch.Tensor  # (m, 3) corners of the triangles, counter-clockwise seen from outside
     weights: torch.Tensor  # (m, 3) barycentric coordinates of the feet, the sum of each row one
-    # (m, 2, 2) from the triangle's edges to its tangents at rest: the inverse of their coordinates [1/m]
+    # (m, 2, 2) from the triangle's edges to its tangents at rest: the inverse of their coordinates
+    # [1/m]
     unstretch: torch.Tensor
     offsets: torch.Tensor  # (m, 3) stems [m] along the first and second tangent and the normal
     axes: torch.Tensor  # (m, 3, 3) tangents and normal at rest, as columns
 
     @override
     def moved(self, by: torch.Tensor) -> "SurfaceMarkers":
-        return replace(self, offsets=self.offsets + torch.einsum("mij,mi->mj", self.axes, by.to(self.offsets)))
+        return replace(
+            self, offsets=self.offsets + torch.einsum("mij,mi->mj", self.axes, by.to(self.offsets))
+        )
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
@@ -207,7 +237,10 @@ class SurfaceMarkers(Markers):
 
 @dataclass(frozen=True)
 class RigidMarkers(Markers):
-    """Markers that follow the rigid motion of a set of vertices; kind ``rigid`` (see the module)."""
+    """Markers that follow the rigid motion of a set of vertices.
+
+    Kind ``rigid`` (see the module).
+    """
 
     vertices: torch.Tensor  # (S,) three or more, not on one line
     rest: torch.Tensor  # (S, 3) [m] vertices at rest, relative to their centre
@@ -235,7 +268,10 @@ class JoinedMarkers(Markers):
 
     @classmethod
     def of(cls, parts: Sequence["BoundMarkers"], places: Sequence[list[int]]) -> "BoundMarkers":
-        """Returns the markers of parts with their indices among all markers; the part itself if there is one."""
+        """Returns the markers of parts with their indices among all markers.
+
+        The part itself if there is one.
+        """
         if len(parts) == 1:
             return parts[0]
         flat, order = list[SurfaceMarkers | RigidMarkers](), list[int]()
@@ -257,7 +293,9 @@ class JoinedMarkers(Markers):
     def moved(self, by: torch.Tensor) -> "JoinedMarkers":
         counts = [len(part.offsets) for part in self.parts]
         in_parts = by[torch.argsort(self.order).to(by.device)].split(counts)
-        parts = tuple(part.moved(offsets) for part, offsets in zip(self.parts, in_parts, strict=True))
+        parts = tuple(
+            part.moved(offsets) for part, offsets in zip(self.parts, in_parts, strict=True)
+        )
         return replace(self, parts=parts)
 
 
@@ -267,14 +305,17 @@ BoundMarkers = SurfaceMarkers | RigidMarkers | JoinedMarkers
 def tangent_frames(corners: torch.Tensor, unstretch: torch.Tensor) -> torch.Tensor:
     """Rotated tangents and normals (B, m, 3, 3) of deformed triangles, as columns.
 
-    With f1, f2 the images of the orthonormal tangents and n the unit normal, f1 + f2 x n points along the first column
-    of the rotation closest to the deformation of the plane: the polar factor of [[a, b], [c, d]] is the matrix
-    [[a + d, b - c], [c - b, a + d]], scaled to determinant one. Corners are (B, m, 3, 3) [m].
+    With f1, f2 the images of the orthonormal tangents and n the unit normal, f1 + f2 x n points
+    along the first column of the rotation closest to the deformation of the plane: the polar factor
+    of [[a, b], [c, d]] is the matrix [[a + d, b - c], [c - b, a + d]], scaled to determinant one.
+    Corners are (B, m, 3, 3) [m].
     """
     edges = corners[:, :, 1:] - corners[:, :, :1]  # (B, m, 2, 3)
     first, second = torch.einsum("bmki,mkj->jbmi", edges, unstretch)
     normal = torch.nn.functional.normalize(torch.linalg.cross(first, second), dim=-1, eps=0.0)
-    along = torch.nn.functional.normalize(first + torch.linalg.cross(second, normal), dim=-1, eps=0.0)
+    along = torch.nn.functional.normalize(
+        first + torch.linalg.cross(second, normal), dim=-1, eps=0.0
+    )
     return torch.stack([along, torch.linalg.cross(normal, along), normal], dim=-1)
 
 
@@ -291,9 +332,9 @@ def bind_markers(
 ) -> BoundMarkers:
     """Binds markers to a body at rest.
 
-    A marker is bound to a triangle of `surface.closest_points`. Beside an edge, a ``normal`` one stands on the plane of
-    that adjacent triangle which it lies most squarely above, possibly outside of the triangle, and a ``frame`` one on
-    the edge.
+    A marker is bound to a triangle of `surface.closest_points`. Beside an edge, a ``normal`` one
+    stands on the plane of that adjacent triangle which it lies most squarely above, possibly
+    outside of the triangle, and a ``frame`` one on the edge.
 
     Args:
         mesh: The body.
@@ -301,16 +342,16 @@ def bind_markers(
         names: m names.
         kind: One of `KINDS` for all markers, or one for every marker.
         vertices: (S,) the vertices that ``rigid`` markers follow.
-        patch: Radius around the foot of a ``patch`` marker, the closest point of the surface, of the vertices that it
-            follows [m].
+        patch: Radius around the foot of a ``patch`` marker, the closest point of the surface, of
+            the vertices that it follows [m].
         largest_distance: Largest distance of a marker from the surface [m].
 
     Returns:
         Markers in float64 on the CPU.
 
     Raises:
-        InputError: A marker is too far from the surface or not finite, a kind is unknown, or the vertices of ``rigid``
-            markers are missing, too few, on one line or not in the mesh.
+        InputError: A marker is too far from the surface or not finite, a kind is unknown, or the
+            vertices of ``rigid`` markers are missing, too few, on one line or not in the mesh.
     """
     points = np.asarray(positions, dtype=np.float64)
     kinds = [kind] * len(names) if isinstance(kind, str) else list(kind)
@@ -319,12 +360,19 @@ def bind_markers(
     worst = int(np.argmax(np.abs(feet.distances)))
     if abs(feet.distances[worst]) > largest_distance:
         raise InputError(
-            f"Marker '{names[worst]}' is {1e3 * abs(feet.distances[worst]):.1f} mm from the surface of the body, more "
-            f"than {1e3 * largest_distance:.1f} mm: check its position, the unit of the mesh and the registration."
+            f"Marker '{names[worst]}' is {1e3 * abs(feet.distances[worst]):.1f} mm from the "
+            f"surface of the body, more than {1e3 * largest_distance:.1f} mm: check its "
+            "position, the unit of the mesh and the registration."
         )
-    flat, parts, places = np.array(kinds) == "normal", list[SurfaceMarkers | RigidMarkers](), list[list[int]]()
+    flat = np.array(kinds) == "normal"
+    parts = list[SurfaceMarkers | RigidMarkers]()
+    places = list[list[int]]()
     if len(surface := np.flatnonzero(flat | (np.array(kinds) == "frame"))):
-        parts.append(_on_triangles(mesh, feet.triangles[surface], points[surface], feet.points[surface], flat[surface]))
+        parts.append(
+            _on_triangles(
+                mesh, feet.triangles[surface], points[surface], feet.points[surface], flat[surface]
+            )
+        )
         places.append(surface.tolist())
     if rigid := [number for number, name in enumerate(kinds) if name == "rigid"]:
         parts.append(follow_vertices(mesh, vertices, points[rigid]))
@@ -333,8 +381,8 @@ def bind_markers(
         near = np.flatnonzero(np.linalg.norm(mesh.vertices - feet.points[number], axis=1) <= patch)
         if len(near) < _LEAST_PATCH:
             raise InputError(
-                f"Marker '{names[number]}' follows {len(near)} vertices within {1e3 * patch:.3g} mm of its foot: "
-                "widen the patch."
+                f"Marker '{names[number]}' follows {len(near)} vertices within {1e3 * patch:.3g} "
+                "mm of its foot: widen the patch."
             )
         parts.append(follow_vertices(mesh, near, points[number][None]))
         places.append([number])
@@ -345,20 +393,28 @@ def _check_bound(points: FloatArray, names: Sequence[str], kinds: Sequence[str])
     """Refuses markers without a place (m, 3) or of an unknown kind."""
     if points.shape != (len(names), 3) or len(kinds) != len(names) or not len(names):
         raise InputError(
-            f"{len(names)} markers are named, with {len(kinds)} kinds and positions {points.shape}: there must be a "
-            "kind and three coordinates for each, and one marker at least."
+            f"{len(names)} markers are named, with {len(kinds)} kinds and positions "
+            f"{points.shape}: there must be a kind and three coordinates for each, "
+            "and one marker at least."
         )
     for name, point, kind in zip(names, points, kinds, strict=True):
         if kind not in KINDS:
-            raise InputError(f"The kind of marker '{name}' is {kind!r}: choose one of {', '.join(KINDS)}.")
+            raise InputError(
+                f"The kind of marker '{name}' is {kind!r}: choose one of {', '.join(KINDS)}."
+            )
         if not np.isfinite(point).all():
-            raise InputError(f"Marker '{name}' was not seen at rest, so it cannot be bound: leave it out.")
+            raise InputError(
+                f"Marker '{name}' was not seen at rest, so it cannot be bound: leave it out."
+            )
 
 
 def _on_triangles(
     mesh: Mesh, triangles: IntArray, points: FloatArray, closest: FloatArray, flat: BoolArray
 ) -> SurfaceMarkers:
-    """Markers with feet at the closest points; those of `flat` markers at their projections on the triangle's plane."""
+    """Markers with feet at the closest points.
+
+    Those of `flat` markers at their projections on the triangle's plane.
+    """
     corners = mesh.vertices[triangles]  # (m, 3, 3)
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)  # (m, 3, 2), as columns
     normal = np.cross(edges[:, :, 0], edges[:, :, 1])
@@ -368,7 +424,8 @@ def _on_triangles(
     unstretch = np.linalg.inv(np.swapaxes(frame[:, :, :2], 1, 2) @ edges)
     above = np.sum((points - corners[:, 0]) * normal, axis=1, keepdims=True)
     feet = np.where(flat[:, None], points - above * normal, closest)
-    inside = unstretch @ (np.swapaxes(frame[:, :, :2], 1, 2) @ (feet - corners[:, 0])[:, :, None])  # (m, 2, 1)
+    # (m, 2, 1)
+    inside = unstretch @ (np.swapaxes(frame[:, :, :2], 1, 2) @ (feet - corners[:, 0])[:, :, None])
     weights = np.concatenate([1.0 - inside.sum(axis=1), inside[:, :, 0]], axis=1)
     stems = points - np.einsum("mki,mk->mi", corners, weights)
     offsets = (np.swapaxes(frame, 1, 2) @ stems[:, :, None])[:, :, 0]
@@ -377,7 +434,8 @@ def _on_triangles(
 
 
 def follow_vertices(mesh: Mesh, vertices: ArrayLike | None, points: FloatArray) -> RigidMarkers:
-    """Returns points (m, 3) of the undeformed body [m] that follow the rigid motion of some of its vertices (S,).
+    """Returns points (m, 3) of the undeformed body [m]
+    that follow the rigid motion of some of its vertices (S,).
 
     Raises:
         InputError: vertices that are missing, too few, on one line or not in the mesh.
@@ -385,12 +443,14 @@ def follow_vertices(mesh: Mesh, vertices: ArrayLike | None, points: FloatArray) 
     chosen = np.unique(np.asarray([] if vertices is None else vertices, dtype=np.int64))
     if len(chosen) < 3 or chosen[0] < 0 or chosen[-1] >= len(mesh.vertices):
         raise InputError(
-            f"Rigid markers follow {len(chosen)} vertices: give three or more of the {len(mesh.vertices)} of the mesh, "
-            "such as those of a face."
+            f"Rigid markers follow {len(chosen)} vertices: give three or more of the "
+            f"{len(mesh.vertices)} of the mesh, such as those of a face."
         )
     centre = mesh.vertices[chosen].mean(axis=0)
     rest = mesh.vertices[chosen] - centre
     spread = np.linalg.svd(rest, compute_uv=False)
     if spread[1] <= 1e-6 * spread[0]:
-        raise InputError("The vertices that rigid markers follow lie on one line: choose those of a face.")
+        raise InputError(
+            "The vertices that rigid markers follow lie on one line: choose those of a face."
+        )
     return RigidMarkers(*map(torch.as_tensor, (chosen, rest, points - centre)))

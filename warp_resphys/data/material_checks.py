@@ -1,7 +1,8 @@
 """Checks that a table of a material test is one test of one specimen, with a clock and with units.
 
-Limits are those of elastomers: silicones have shear moduli of 10 kPa and more, and of 19 silicones of a public database
-none has a curve up to 300 % whose slopes differ by less than a quarter, or up to 1200 % by less than a factor of two.
+Limits are those of elastomers: silicones have shear moduli of 10 kPa and more, and of 19 silicones
+of a public database none has a curve up to 300 % whose slopes differ by less than a quarter, or up
+to 1200 % by less than a factor of two.
 """
 
 from collections.abc import Sequence
@@ -74,7 +75,8 @@ def in_time(read: MeasuredTable, shown: str, path: Path) -> MeasuredTable:
         path: of the table.
 
     Raises:
-        DataFileError: another specimen begins, where the clock falls or is missing and the deformation falls at once.
+        DataFileError: another specimen begins, where the clock falls or is missing and the
+            deformation falls at once.
     """
     seconds = read.columns.get("time")
     steps = np.zeros(0) if seconds is None else np.diff(seconds)
@@ -84,9 +86,10 @@ def in_time(read: MeasuredTable, shown: str, path: Path) -> MeasuredTable:
     if begins:
         before, after = length[begins[0] - 1], length[begins[0]]
         raise DataFileError(
-            f"{path}, line {read.lines[begins[0]]}: the {shown} falls from {before:.3g} to {after:.3g} at once, as "
-            "where another specimen or cycle begins: write each specimen into a file of its own, and cycles with their "
-            "unloading and the time since the start."
+            f"{path}, line {read.lines[begins[0]]}: the {shown} falls from {before:.3g} to "
+            f"{after:.3g} at once, as where another specimen or cycle begins: write each "
+            "specimen into a file of its own, "
+            "and cycles with their unloading and the time since the start."
         )
     if seconds is None or not len(steps):
         return read
@@ -95,39 +98,58 @@ def in_time(read: MeasuredTable, shown: str, path: Path) -> MeasuredTable:
     anew = [row for row in falls if 0.0 <= seconds[row] <= _BEGINS * after[row]]
     if len(anew) < len(falls) or 2 * repeated.sum() > len(seconds):
         row = falls[0] if len(falls) else int(np.argmax(repeated))
-        what = f"falls from {seconds[row - 1]:g} to {seconds[row]:g} s" if len(falls) else "stands still"
-        note = f"The time {what} in line {read.lines[row]}: times are not read, which relaxing branches need."
+        what = (
+            f"falls from {seconds[row - 1]:g} to {seconds[row]:g} s"
+            if len(falls)
+            else "stands still"
+        )
+        note = (
+            f"The time {what} in line {read.lines[row]}: "
+            "times are not read, which relaxing branches need."
+        )
         columns = {name: values for name, values in read.columns.items() if name != "time"}
         return replace(read, columns=columns, notes=(*read.notes, note))
     if anew:
         joined = seconds.copy()
         for row in anew:
             joined[row:] += seconds[row - 1] + (after[row] if seconds[row] == 0.0 else 0.0)
-        note = f"The time begins anew in {lines_of(read.lines[anew])}: it was taken to go on from the line before."
+        note = (
+            f"The time begins anew in {lines_of(read.lines[anew])}: "
+            "it was taken to go on from the line before."
+        )
         read = replace(read, columns={**read.columns, "time": joined}, notes=(*read.notes, note))
     return read.without(repeated, "which repeat the time before them")
 
 
 def _restarts(length: FloatArray) -> list[int]:
-    """Returns the rows where a deformation (N,) falls back at once, and from where it grows again, but not at once."""
+    """Returns the rows where a deformation (N,) falls back at once,
+    and from where it grows again, but not at once.
+    """
     steps = np.diff(length)
     if len(steps) < 2 * LEAST:
         return []
-    at_once = np.abs(steps) > max(_AT_ONCE * float(np.median(np.abs(steps))), _PART * float(np.ptp(length)))
+    at_once = np.abs(steps) > max(
+        _AT_ONCE * float(np.median(np.abs(steps))), _PART * float(np.ptp(length))
+    )
     back = at_once & (np.abs(length[1:]) < _LEFT * np.abs(length[:-1]))
     if (at_once & (np.abs(length[1:]) > np.abs(length[:-1]))).any():
         return []  # steps to and fro
     found = list[int]()
     for row in np.flatnonzero(back) + 1:
         before, after = abs(length[row - 1]), np.abs(length[row:])
-        if row >= LEAST and len(after) >= LEAST and after[:LEAST].max() < 0.5 * before < 5.0 * (after.max() - after[0]):
+        if (
+            row >= LEAST
+            and len(after) >= LEAST
+            and after[:LEAST].max() < 0.5 * before < 5.0 * (after.max() - after[0])
+        ):
             found.append(int(row))
     return found
 
 
 def check_no_stretch(read: MeasuredTable, path: Path) -> None:
     """Refuses a strain that is one where the load is least, and grows or falls from there."""
-    strain, load = read.columns["strain"], np.abs(read.columns["stress" if "stress" in read.columns else "force"])
+    strain = read.columns["strain"]
+    load = np.abs(read.columns["stress" if "stress" in read.columns else "force"])
     unloaded = float(strain[np.argmin(load)]) if len(load) else 0.0
     if len(strain) < LEAST or not 0.9 <= unloaded <= 1.1:
         return
@@ -136,8 +158,8 @@ def check_no_stretch(read: MeasuredTable, path: Path) -> None:
     grows = np.median(load[near]) < 0.8 * np.median(load[~near]) if not near.all() else False
     if (strain.min() >= 0.9 or strain.max() <= 1.1) and load.min() < 0.2 * load.max() and grows:
         raise DataFileError(
-            f"{path}: the strain is {unloaded:.3g} in line {read.lines[np.argmin(load)]}, where the load is least, as "
-            "a stretch is: name its column 'stretch', or subtract 1."
+            f"{path}: the strain is {unloaded:.3g} in line {read.lines[np.argmin(load)]}, where "
+            "the load is least, as a stretch is: name its column 'stretch', or subtract 1."
         )
 
 
@@ -151,8 +173,8 @@ def check_unit(read: MeasuredTable, strain: FloatArray, stress: FloatArray, path
         path: of the table.
 
     Raises:
-        DataFileError: as the strain would be of a material that is softer than silicones, or whose curve is straight
-            where none of an elastomer is.
+        DataFileError: as the strain would be of a material that is softer than silicones, or whose
+            curve is straight where none of an elastomer is.
     """
     most = float(np.abs(strain).max()) if len(strain) else 0.0
     if read.bare is None or not most:
@@ -161,14 +183,15 @@ def check_unit(read: MeasuredTable, strain: FloatArray, stress: FloatArray, path
     limit = _STRAIGHT[modulus < _SOFT or most > _LONG]
     if modulus < _SOFTEST or (most >= _FAR and _spread(np.abs(strain), np.abs(stress)) < limit):
         raise DataFileError(
-            f"{path}: the column {read.bare!r} has no unit and reaches {most:.3g}; if that were {100.0 * most:.5g} %, "
-            f"the curve would be none of an elastomer (shear modulus {1e-3 * modulus:.2g} kPa): write '{read.bare} [%]'"
-            f" if it is in per cent, '{read.bare} [1]' if not."
+            f"{path}: the column {read.bare!r} has no unit and reaches {most:.3g}; if that were "
+            f"{100.0 * most:.5g} %, the curve would be none of an elastomer (shear modulus "
+            f"{1e-3 * modulus:.2g} kPa): write '{read.bare} [%]' if it is in per cent, "
+            f"'{read.bare} [1]' if not."
         )
 
 
 def _spread(strain: FloatArray, load: FloatArray) -> float:
-    """Returns the ratio of the largest and the smallest slope of a curve up to its largest strain."""
+    """The ratio of the largest and the smallest slope of a curve up to its largest strain."""
     end = int(np.argmax(strain)) + 1
     edges, slopes = np.linspace(strain[:end].min(), strain[:end].max(), _PARTS + 1), list[float]()
     for low, high in pairwise(edges):

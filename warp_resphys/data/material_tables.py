@@ -1,7 +1,10 @@
-"""Tables of material tests: columns of time, strain or displacement, and stress or force; of membranes.
+"""Tables of material tests: columns of time, strain or displacement, and stress or force.
 
-A line whose cells are no numbers is left out, and named. What says that the table is not one test is refused: a time
-that falls, a header that is repeated, a strain that falls back at once, and strains that no elastomer has.
+Of membranes.
+
+A line whose cells are no numbers is left out, and named. What says that the table is not one test
+is refused: a time that falls, a header that is repeated, a strain that falls back at once, and
+strains that no elastomer has.
 """
 
 import re
@@ -17,7 +20,15 @@ from ..io.arrays import BoolArray, Brief, FloatArray
 from ..io.errors import DataFileError, did_you_mean, listed, warn
 from ..io.text import Rows, number, read_rows, read_text
 from ..settings.data_kinds import TableSettings
-from .material_checks import LEAST, MeasuredTable, check_no_stretch, check_unit, in_time, left_out, lines_of
+from .material_checks import (
+    LEAST,
+    MeasuredTable,
+    check_no_stretch,
+    check_unit,
+    in_time,
+    left_out,
+    lines_of,
+)
 from .recordings.recording import METRES_PER_UNIT
 
 _PRESSURES: Final = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "psi": 6894.757}
@@ -30,7 +41,8 @@ _UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "force": {"N": 1.0, "kN": 1e3, "mN": 1e-3, "lbf": 4.448222, "kgf": 9.80665, "gf": 9.80665e-3},
 }
 _BARE: Final = ("strain", "stretch")  # that may have no unit
-_SYNONYMS: Final = {"extension": "displacement", "load": "force"}  # where no column has the word itself
+# Where no column has the word itself.
+_SYNONYMS: Final = {"extension": "displacement", "load": "force"}
 _SPELLED: Final = {
     "sec": "s",
     "S": "s",
@@ -48,7 +60,7 @@ _PAIRS: Final = (("strain", "displacement", "stretch"), ("stress", "force"))
 
 
 def read_test(path: Path, table: TableSettings | None = None) -> dict[str, FloatArray]:
-    """Returns the columns (N,) of a table in SI units, by their names, and warns of what is left out.
+    """Returns columns (N,) of a table in SI units, by their names, and warns of what is left out.
 
     For arguments and errors see `read_measured`.
     """
@@ -62,21 +74,29 @@ def read_measured(path: Path, table: TableSettings | None = None) -> MeasuredTab
     """Reads a table; lines without a number, and those that repeat a time, are left out.
 
     Args:
-        path: of the text file, whose header has ``time [s]``, ``strain``, ``stretch`` or ``displacement [mm]``, and
-            ``stress [kPa]`` or ``force [N]``, of the undeformed section and length.
+        path: of the text file, whose header has ``time [s]``, ``strain``, ``stretch`` or
+            ``displacement [mm]``, and ``stress [kPa]`` or ``force [N]``, of the undeformed section
+            and length.
         table: columns of a file with another header.
 
     Raises:
-        DataFileError: the file is no table, a column is missing, a unit is not known, the lines are not of one test, or
-            strains without a unit are none of an elastomer.
+        DataFileError: the file is no table, a column is missing, a unit is not known, the lines are
+            not of one test, or strains without a unit are none of an elastomer.
     """
     rows = read_rows(path)
     first, named = _header(rows, path) if table is None else _described(rows, table, path)
     names, factors, bare = _meanings(named, rows[first:], table is None, path)
     read = replace(_numbers(rows, first, names, factors, path), bare=bare)
     if table is None:
-        words = [cell for column, cell in named.items() if column not in names and _is_text(rows[first:], column)]
-        notes = (*read.notes, *([f"Columns of text are not read: {listed(words)}."] if words else []))
+        words = [
+            cell
+            for column, cell in named.items()
+            if column not in names and _is_text(rows[first:], column)
+        ]
+        notes = (
+            *read.notes,
+            *([f"Columns of text are not read: {listed(words)}."] if words else []),
+        )
         read = replace(read, notes=notes)
     read = in_time(read, next(name for name in _PAIRS[0] if name in read.columns), path)
     if "strain" in read.columns:
@@ -86,14 +106,16 @@ def read_measured(path: Path, table: TableSettings | None = None) -> MeasuredTab
     if "stretch" in read.columns:
         columns = dict(read.columns)
         strain = columns.pop("stretch") - 1.0
-        read = replace(read, columns={**columns, "strain": strain if strain.sum() > 0.0 else -strain})
+        read = replace(
+            read, columns={**columns, "strain": strain if strain.sum() > 0.0 else -strain}
+        )
     return read
 
 
 def _meanings(
     named: Mapping[int, str], rows: Rows, by_header: bool, path: Path
 ) -> tuple[dict[int, str], dict[int, float], str | None]:
-    """Returns quantities and factors to SI units by column, and the header of a strain without a unit."""
+    """Quantities and factors to SI units by column, and the header of a strain without a unit."""
     factors, names, bare = dict[int, float](), dict[int, str](), None
     cells = {column: _name_and_unit(cell) for column, cell in named.items()}
     words = [name for name, _ in cells.values()]
@@ -103,24 +125,37 @@ def _meanings(
             if by_header:
                 continue
             raise DataFileError(
-                f"{path}: data.table has the column {named[column]!r}: choose from {', '.join(_UNITS)}."
+                f"{path}: data.table has the column {named[column]!r}: choose from "
+                f"{', '.join(_UNITS)}."
             )
         if unit not in known and not (unit == "" and name in _BARE):
             text = all(number(row[column]) is None for row in rows if column < len(row))
-            if by_header and ((name == "time" and text) or any(w == word and u in known for w, u in cells.values())):
+            if by_header and (
+                (name == "time" and text)
+                or any(w == word and u in known for w, u in cells.values())
+            ):
                 continue  # a clock in words, or the same quantity in volts
-            missing = f"the column {named[column]!r} has {'the unit ' + repr(unit) if unit else 'no unit'}"
-            raise DataFileError(f"{path}: {missing}: write it as in '{name} [{'], ['.join(known)}]'.")
+            missing = (
+                f"the column {named[column]!r} has "
+                f"{'the unit ' + repr(unit) if unit else 'no unit'}"
+            )
+            raise DataFileError(
+                f"{path}: {missing}: write it as in '{name} [{'], ['.join(known)}]'."
+            )
         if name in names.values():
-            raise DataFileError(f"{path} has two columns of {name}: leave one of them out in data.table.")
+            raise DataFileError(
+                f"{path} has two columns of {name}: leave one of them out in data.table."
+            )
         names[column], factors[column] = name, known[unit or "1"]
         bare = named[column] if name == "strain" and not unit else bare
     for pair in _PAIRS:
-        if (present := [name for name in pair if name in names.values()]) != present[:1] or not present:
+        if (present := [name for name in pair if name in names.values()]) != present[
+            :1
+        ] or not present:
             raise DataFileError(
-                f"{path} has {len(present)} of the columns {' and '.join(pair[:2])}, of which a test has one. It has "
-                f"{listed([*named.values()])}: name them in its header, as in 'time [s], strain, stress [kPa]', or in "
-                "data.table."
+                f"{path} has {len(present)} of the columns {' and '.join(pair[:2])}, of which a "
+                f"test has one. It has {listed([*named.values()])}: name them in its header, as "
+                "in 'time [s], strain, stress [kPa]', or in data.table."
             )
     return names, factors, bare
 
@@ -137,20 +172,25 @@ def _numbers(
             continue
         if row == header:
             raise DataFileError(
-                f"{path}, line {line} repeats the header of line {first}: a table has one test of one specimen; write "
-                "each into a file of its own."
+                f"{path}, line {line} repeats the header of line {first}: a table has one test "
+                "of one specimen; write each into a file of its own."
             )
         if any(row[width:]):
             raise DataFileError(
-                f"{path}, line {line} has {len(row)} cells where its header has {width}: leave out marks between "
-                "thousands, put text with commas in quotation marks, and name each column."
+                f"{path}, line {line} has {len(row)} cells where its header has {width}: leave "
+                "out marks between thousands, put text with commas in quotation marks, "
+                "and name each column."
             )
         cells = [row[column] if column < len(row) else "" for column in names]
         given = [number(cell) for cell in cells]
-        broken = next((k for k, cell in enumerate(cells) if given[k] is None and cell[:1].isdecimal()), None)
+        broken = next(
+            (k for k, cell in enumerate(cells) if given[k] is None and cell[:1].isdecimal()), None
+        )
         if broken is not None:
             name = [*names.values()][broken]
-            raise DataFileError(f"{path}, line {line}: {cells[broken]!r} in the column of {name} is not a number.")
+            raise DataFileError(
+                f"{path}, line {line}: {cells[broken]!r} in the column of {name} is not a number."
+            )
         known = [value for value in given if value is not None and np.isfinite(value)]
         if len(known) == len(names):
             values.append(known)
@@ -172,7 +212,14 @@ def _is_text(rows: Rows, column: int) -> bool:
     return bool(filled) and all(number(cell) is None for cell in filled)
 
 
-_MEMBRANE: Final = ("thickness", "contact_radius", "ring1_radius", "ring1_width", "ring2_radius", "ring2_width")
+_MEMBRANE: Final = (
+    "thickness",
+    "contact_radius",
+    "ring1_radius",
+    "ring1_width",
+    "ring2_radius",
+    "ring2_width",
+)
 _LIFTED: Final = ("height_mm", "pressure_Pa", "lifted_force_N")
 _DIGITS: Final = 3  # of a weight [N]
 _SCATTER: Final = 0.01  # of a weight that is measured
@@ -190,34 +237,46 @@ class MembraneTable(Brief):
     force: FloatArray  # (N,) weight of the cap [N]
 
     def weights(self) -> tuple[dict[str, tuple[float, BoolArray]], list[str]]:
-        """Returns weights [N] and rows (N,) by a name of their own, such as '14.7 N', and what was left out.
+        """Returns weights [N] and rows (N,) by a name of their own,
+        such as '14.7 N', and what was left out.
 
-        A measured force scatters: where values repeat in fewer than five rows, those within 1 % of the next are one.
+        A measured force scatters: where values repeat in fewer than five rows, those within 1 % of
+        the next are one.
         """
         force, notes = self.force.round(_DIGITS), list[str]()
         values, number_of_row, counts = np.unique(force, return_inverse=True, return_counts=True)
         if (counts < LEAST).any():
-            number_of_row = np.cumsum(np.append(False, np.diff(values) > _SCATTER * values[1:]))[number_of_row]
+            group = np.cumsum(np.append(False, np.diff(values) > _SCATTER * values[1:]))
+            number_of_row = group[number_of_row]
             values = np.bincount(number_of_row, force) / np.bincount(number_of_row)
             scatter = max(float(np.ptp(force[number_of_row == k])) for k in range(len(values)))
             if scatter:
-                notes.append(f"Forces that differ by less than {100.0 * _SCATTER:g} % count as one weight.")
+                notes.append(
+                    f"Forces that differ by less than {100.0 * _SCATTER:g} % count as one weight."
+                )
         few = np.bincount(number_of_row)[number_of_row] < LEAST
         if few.any():
             notes.append(
-                left_out(int(few.sum()), len(few), f"under {force[few][0]:g} N, fewer than {LEAST} of a weight")
+                left_out(
+                    int(few.sum()),
+                    len(few),
+                    f"under {force[few][0]:g} N, fewer than {LEAST} of a weight",
+                )
             )
         kept, digits = np.unique(number_of_row[~few]), 3
         while len({f"{values[k]:.{digits}g}" for k in kept}) < len(kept):
             digits += 1
-        return {f"{values[k]:.{digits}g} N": (float(values[k]), number_of_row == k) for k in kept}, notes
+        return {
+            f"{values[k]:.{digits}g} N": (float(values[k]), number_of_row == k) for k in kept
+        }, notes
 
 
 def read_membrane(path: Path) -> MembraneTable:
     """Returns a table of membranes as published with arXiv 2504.01156.
 
-    The first line, ``# thickness_mm,... = [2.0, ...]``, has thickness, radius of the cap, and mean radius and
-    half-width of two rings, nan without them; the second one names the columns, height, pressure and force.
+    The first line, ``# thickness_mm,... = [2.0, ...]``, has thickness, radius of the cap, and mean
+    radius and half-width of two rings, nan without them; the second one names the columns, height,
+    pressure and force.
 
     Raises:
         DataFileError: the file is no such table.
@@ -229,15 +288,19 @@ def read_membrane(path: Path) -> MembraneTable:
     sizes = {name: value for name, value in zip(names, values, strict=False) if value is not None}
     if lost := [name for name in _MEMBRANE if name not in sizes]:
         raise DataFileError(
-            f"{path}, line 1 has no {lost[0]}_mm: begin the table of a membrane with '# {'_mm,'.join(_MEMBRANE)}_mm = "
-            "[2.0, 25.4, nan, nan, nan, nan]'."
+            f"{path}, line 1 has no {lost[0]}_mm: begin the table of a membrane with '# "
+            f"{'_mm,'.join(_MEMBRANE)}_mm = [2.0, 25.4, nan, nan, nan, nan]'."
         )
     header = [cell.strip() for cell in lines[1].split(",")] if len(lines) > 1 else []
     if lost := [name for name in _LIFTED if name not in header]:
-        raise DataFileError(f"{path}, line 2 has no column {lost[0]}: name the columns {', '.join(_LIFTED)}.")
+        raise DataFileError(
+            f"{path}, line 2 has no column {lost[0]}: name the columns {', '.join(_LIFTED)}."
+        )
     rows = [[number(cell) for cell in line.split(",")] for line in lines[2:] if line.strip()]
     if bad := [k for k, row in enumerate(rows, start=3) if len(row) != len(header) or None in row]:
-        raise DataFileError(f"{path}, line {bad[0]}: give a number for each of the columns {', '.join(header)}.")
+        raise DataFileError(
+            f"{path}, line {bad[0]}: give a number for each of the columns {', '.join(header)}."
+        )
     table = np.array(rows, dtype=np.float64).reshape(-1, len(header))
     height, pressure, force = (table[:, header.index(name)] for name in _LIFTED)
     rings = [(1e-3 * sizes[f"ring{k}_radius"], 1e-3 * sizes[f"ring{k}_width"]) for k in (1, 2)]
@@ -252,7 +315,10 @@ def read_membrane(path: Path) -> MembraneTable:
 
 
 def _name_and_unit(cell: str) -> tuple[str, str]:
-    """Returns name, in small letters, and unit of a column such as `Force (N)` or `Force_N`; the unit may be empty."""
+    """Returns name, in small letters, and unit of a column such as `Force (N)` or `Force_N`.
+
+    The unit may be empty.
+    """
     match = _CELL.fullmatch(cell.strip())
     assert match is not None
     name, unit = match[1].lower(), (match[2] or "").strip()
@@ -265,15 +331,21 @@ def _name_and_unit(cell: str) -> tuple[str, str]:
 def _header(rows: Rows, path: Path) -> tuple[int, dict[int, str]]:
     """Returns the number of the first line of numbers, and the cells of the line before, by column.
 
-    Of several tables in a file, such as results above the samples, it is the longest with the columns of a test.
+    Of several tables in a file, such as results above the samples, it is the longest with the
+    columns of a test.
     """
-    starts = [line for line in range(1, len(rows)) if _has_numbers(rows[line]) and not _has_numbers(rows[line - 1])]
+    starts = [
+        line
+        for line in range(1, len(rows))
+        if _has_numbers(rows[line]) and not _has_numbers(rows[line - 1])
+    ]
     found = list[tuple[bool, int, int, dict[int, str]]]()
     for start, stop in pairwise([*starts, len(rows)]):
         above = [line for line in range(start) if any(rows[line])][-2:]
         head, units = rows[above[-1]] if above else [], [""] * len(rows[start])
         if len(above) > 1 and all(cell.strip("[]()") in _ALL_UNITS for cell in head if cell):
-            head, units = rows[above[0]], [cell.strip("[]()") for cell in head]  # units have a line of their own
+            # Units have a line of their own.
+            head, units = rows[above[0]], [cell.strip("[]()") for cell in head]
         beside = {column: f" [{unit}]" if unit else "" for column, unit in enumerate(units)}
         cells = {column: cell + beside.get(column, "") for column, cell in enumerate(head) if cell}
         words = {_SYNONYMS.get(word, word) for word, _ in map(_name_and_unit, cells.values())}
@@ -282,12 +354,14 @@ def _header(rows: Rows, path: Path) -> tuple[int, dict[int, str]]:
     whole = [one for one in found if one[0] and one[1] >= LEAST]
     if len(whole) > 1:
         raise DataFileError(
-            f"{path} has {len(whole)} tables, whose numbers begin in {lines_of([one[2] + 1 for one in whole])}: write "
-            "each specimen into a file of its own."
+            f"{path} has {len(whole)} tables, whose numbers begin in "
+            f"{lines_of([one[2] + 1 for one in whole])}: "
+            "write each specimen into a file of its own."
         )
     if not found:
         raise DataFileError(
-            f"{path} has no line of numbers below a header: export it as CSV, with names of its columns."
+            f"{path} has no line of numbers below a header: "
+            "export it as CSV, with names of its columns."
         )
     _, _, start, cells = max(found, key=lambda one: one[:2])
     return start, cells
@@ -301,9 +375,16 @@ def _has_numbers(row: Sequence[str]) -> bool:
 def _described(rows: Rows, table: TableSettings, path: Path) -> tuple[int, dict[int, str]]:
     """Returns the number of the first line of numbers, and the names of the columns by settings."""
     if not table.names:
-        return table.header_lines, {column: cell for column, cell in enumerate(table.columns) if cell}
+        return table.header_lines, {
+            column: cell for column, cell in enumerate(table.columns) if cell
+        }
     header = rows[table.header_lines] if len(rows) > table.header_lines else []
     if lost := [name for name in table.names if header.count(name) != 1]:
-        known = did_you_mean(lost[0], header) or f"; it has {listed([cell for cell in header if cell])}."
-        raise DataFileError(f"{path}, line {table.header_lines + 1}: no single column is named {lost[0]!r}{known}")
+        known = (
+            did_you_mean(lost[0], header)
+            or f"; it has {listed([cell for cell in header if cell])}."
+        )
+        raise DataFileError(
+            f"{path}, line {table.header_lines + 1}: no single column is named {lost[0]!r}{known}"
+        )
     return table.header_lines + 1, {header.index(name): cell for name, cell in table.names.items()}

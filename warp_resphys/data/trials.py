@@ -21,14 +21,22 @@ from ..stepping.rotations import rotations
 from .base_motion import at_times, contact_inputs
 
 PAYLOAD: Final = Quantity(
-    "payload", "kg", 0.0, closed=True, typical=0.05, words="weight", shown_unit="g", shown_factor=1e3
+    "payload",
+    "kg",
+    0.0,
+    closed=True,
+    typical=0.05,
+    words="weight",
+    shown_unit="g",
+    shown_factor=1e3,
 )
 GIVEN: Final = "given"  # beginning of trials whose initial state is known
 RELEASED: Final = "released"
 STATIC: Final = "static"
 UNDER_INPUTS: Final = "driven"  # of a body at rest under the inputs of the first frame
 SLACK: Final = "slack"  # the same, where these do not act; as UNDER_INPUTS in a dataset
-RESTING: Final = ("rest", UNDER_INPUTS, SLACK)  # of motions that inputs begin, read at the time steps
+# Of motions that inputs begin, read at the time steps.
+RESTING: Final = ("rest", UNDER_INPUTS, SLACK)
 _KIND = "dataset"
 _RESTING, _CHANNELS = "_resting", "_channels"  # ends of names in a file
 T = TypeVar("T")
@@ -46,7 +54,8 @@ class Trials(Brief):
     Attributes:
         names: names of the trials.
         labels: labels of the M tracked markers; empty if every vertex is observed.
-        begins: how each trial begins, see `settings.performed.Begins`; held bodies are ``released`` here.
+        begins: how each trial begins, see `settings.performed.Begins`; held bodies are ``released``
+            here.
         times: (R, T) times of the frames [s]; trials that end early repeat their last time.
         observed: (R, T, M, 3) observed positions [m], NaN where a marker was not seen.
         held: (R, M, 3) positions before time zero [m], NaN for markers that a trial does not have.
@@ -54,19 +63,24 @@ class Trials(Brief):
         gravity: (3,) gravity [m/s^2].
         time_step: time step of the inputs [s].
         bound: (M, 3) markers on the undeformed body [m]; None for vertices.
-        initial: (R, 2, N, 3) initial positions [m] and velocities [m/s] of trials with a given state; None: the first
-            of `observed` and `velocity`.
-        smoothed: (R, T, M, 3) smoothed positions that residual forces are fitted to [m]; None to fit `observed`.
+        initial: (R, 2, N, 3) initial positions [m] and velocities [m/s] of trials with a given
+            state; None: the first of `observed` and `velocity`.
+        smoothed: (R, T, M, 3) smoothed positions that residual forces are fitted to [m]; None to
+            fit `observed`.
         velocity: (R, T, N, 3) velocities of the vertices [m/s], in simulated trials.
-        inputs: (R, K, ...) inputs of the body during each step by name, such as ``pressure`` (R, K, C) [Pa];
-            (R, ...) if constant.
+        inputs: (R, K, ...) inputs of the body during each step by name, such as ``pressure``
+            (R, K, C) [Pa]; (R, ...) if constant.
         channels: names of the C channels, by input.
-        resting: (R, C) inputs before time zero, by name, of trials that begin under inputs; empty if none does.
-        base: (R, K + 1, 6) motion of the base at the steps, see `data.base_motion`; None if the base stands still.
-        obstacles: (R, K + 1, 6) motions of obstacles at the steps by name, see `data.obstacle_motion`.
+        resting: (R, C) inputs before time zero, by name, of trials that begin under inputs; empty
+            if none does.
+        base: (R, K + 1, 6) motion of the base at the steps, see `data.base_motion`; None if the
+            base stands still.
+        obstacles: (R, K + 1, 6) motions of obstacles at the steps by name, see
+            `data.obstacle_motion`.
         sessions: session in which each trial was recorded; empty if there is one.
         units: units of the inputs.
-        loads: (R, T, 6) readings of force sensors by name [N, N m], see `data.force_sensors`; NaN where there is none.
+        loads: (R, T, 6) readings of force sensors by name [N, N m], see `data.force_sensors`; NaN
+            where there is none.
     """
 
     names: tuple[str, ...]
@@ -102,7 +116,10 @@ class Trials(Brief):
         return self.begins[row]
 
     def batches(self, names: Sequence[str]) -> list[tuple[str, ...]]:
-        """Groups trials by how they begin and their session; the trials of a group can be simulated as one batch."""
+        """Groups trials by how they begin and their session.
+
+        The trials of a group can be simulated as one batch.
+        """
         groups: dict[tuple[str, str], list[str]] = {}
         for name in names:
             groups.setdefault((self.begin_of(name), self.session(name)), []).append(name)
@@ -135,11 +152,19 @@ class Trials(Brief):
         Raises:
             DataFileError: the file cannot be written.
         """
-        words = {"names": self.names, "labels": self.labels, "begins": self.begins, "inputs": tuple(self.inputs)}
+        words = {
+            "names": self.names,
+            "labels": self.labels,
+            "begins": self.begins,
+            "inputs": tuple(self.inputs),
+        }
         words |= {"sessions": self.sessions} if self.sessions else {}
         words |= {key: tuple(values) for key in _GROUPS if (values := getattr(self, key))}
         words |= {f"{name}{_CHANNELS}": channels for name, channels in self.channels.items()}
-        attributes = {**{key: list(strings) for key, strings in words.items()}, "gravity": self.gravity}
+        attributes = {
+            **{key: list(strings) for key, strings in words.items()},
+            "gravity": self.gravity,
+        }
         with atomic_hdf5(path, _KIND, {**attributes, "time_step": self.time_step}) as file:
             for name, unit in _UNITS.items():
                 if getattr(self, name) is not None:
@@ -166,14 +191,22 @@ class Trials(Brief):
             more = {key: tuple(map(str, file.attrs.get(key, ()))) for key in ("sessions", *_GROUPS)}
             inputs, r = words.pop("inputs"), len(words["names"])
             times = read_array(file, "times", (r, None))
-            observed = read_array(file, "observed", (r, times.shape[1], len(words["labels"]) or None, 3))
+            observed = read_array(
+                file, "observed", (r, times.shape[1], len(words["labels"]) or None, 3)
+            )
             shapes = {
-                **{"held": (r, observed.shape[2], 3), "payload": (r,), "bound": (observed.shape[2], 3)},
+                **{
+                    "held": (r, observed.shape[2], 3),
+                    "payload": (r,),
+                    "bound": (observed.shape[2], 3),
+                },
                 **{"smoothed": observed.shape, "velocity": observed.shape},
                 **{"initial": (r, 2, None, 3), "base": (r, None, 6)},
             }
             there = {*file, "held", "payload"}
-            arrays = {name: read_array(file, name, x) for name, x in shapes.items() if name in there}
+            arrays = {
+                name: read_array(file, name, x) for name, x in shapes.items() if name in there
+            }
             known: dict[str, Any] = {**words, **arrays}
             resting = [key.removesuffix(_RESTING) for key in file if key.endswith(_RESTING)]
             return cls(
@@ -185,32 +218,55 @@ class Trials(Brief):
                 inputs={name: _of_trials(file, name, r) for name in inputs},
                 resting={name: _of_trials(file, f"{name}{_RESTING}", r) for name in resting},
                 channels={
-                    n: tuple(map(str, file.attrs[f"{n}{_CHANNELS}"])) for n in inputs if f"{n}{_CHANNELS}" in file.attrs
+                    n: tuple(map(str, file.attrs[f"{n}{_CHANNELS}"]))
+                    for n in inputs
+                    if f"{n}{_CHANNELS}" in file.attrs
                 },
                 sessions=more["sessions"],
-                obstacles={n: read_array(file, f"obstacles/{n}", (r, None, 6)) for n in more["obstacles"]},
+                obstacles={
+                    n: read_array(file, f"obstacles/{n}", (r, None, 6)) for n in more["obstacles"]
+                },
                 loads={n: read_array(file, f"loads/{n}", (*times.shape, 6)) for n in more["loads"]},
             )
 
     def joined(self, other: "Trials") -> "Trials":
-        """Returns these trials followed by others of the same body with the same number of frames."""
+        """Returns these trials followed by others of the same body
+        with the same number of frames.
+        """
         arrays = {
-            name: None if getattr(self, name) is None else np.concatenate([getattr(self, name), getattr(other, name)])
-            for name in ("times", "observed", "held", "payload", "initial", "smoothed", "velocity", "base")
+            name: None
+            if getattr(self, name) is None
+            else np.concatenate([getattr(self, name), getattr(other, name)])
+            for name in (
+                "times",
+                "observed",
+                "held",
+                "payload",
+                "initial",
+                "smoothed",
+                "velocity",
+                "base",
+            )
         }
         named = {
             key: {
-                name: np.concatenate([values, getattr(other, key)[name]]) for name, values in getattr(self, key).items()
+                name: np.concatenate([values, getattr(other, key)[name]])
+                for name, values in getattr(self, key).items()
             }
             for key in ("inputs", *_GROUPS)
         }
         resting = {
             name: np.concatenate(
-                [mine.resting.get(name, np.zeros_like(mine.inputs[name][:, 0])) for mine in (self, other)]
+                [
+                    mine.resting.get(name, np.zeros_like(mine.inputs[name][:, 0]))
+                    for mine in (self, other)
+                ]
             )
             for name in {**self.resting, **other.resting}
         }
-        words = {key: getattr(self, key) + getattr(other, key) for key in ("names", "begins", "sessions")}
+        words = {
+            key: getattr(self, key) + getattr(other, key) for key in ("names", "begins", "sessions")
+        }
         changed: dict[str, Any] = {**words, **arrays, **named, "resting": resting}
         return replace(self, **changed)
 
@@ -242,7 +298,10 @@ class Trials(Brief):
         return self.inputs[name].ndim == (3 if name in ("external_force", "fixed_positions") else 2)
 
     def _during(self, name: str, rows: Sequence[int], time_step: float) -> FloatArray:
-        """(K', R, ...) an input resampled to a time step, by its values at the middle of each; (R, ...) if constant."""
+        """(K', R, ...) an input resampled to a time step, by its values at the middle of each.
+
+        (R, ...) if constant.
+        """
         values = self.inputs[name][rows]
         if self._is_constant(name):
             return values
@@ -252,8 +311,15 @@ class Trials(Brief):
         return resampled
 
     def base_at(self, names: Sequence[str], time_step: float) -> torch.Tensor | None:
-        """(K + 1, R, 6) motion of the base in trials, resampled to another time step; None if the base stands still."""
-        return None if self.base is None else torch.from_numpy(self._poses_at(self.base, names, time_step))
+        """(K + 1, R, 6) motion of the base in trials, resampled to another time step.
+
+        None if the base stands still.
+        """
+        return (
+            None
+            if self.base is None
+            else torch.from_numpy(self._poses_at(self.base, names, time_step))
+        )
 
     def _poses_at(self, poses: FloatArray, names: Sequence[str], time_step: float) -> FloatArray:
         """(K' + 1, R', 6) poses (R, K + 1, 6) of some trials, resampled to another time step."""
@@ -261,12 +327,21 @@ class Trials(Brief):
         new = time_step * np.arange(round(times[-1] / time_step) + 1)
         return np.stack([at_times(poses[row], times, new) for row in self.rows(names)], axis=1)
 
-    def contact_at(self, names: Sequence[str], body: Body, time_step: float) -> dict[str, FloatArray]:
-        """(K + 1, R, O) inputs of a body's contact in trials by name, those that move an obstacle in any trial."""
+    def contact_at(
+        self, names: Sequence[str], body: Body, time_step: float
+    ) -> dict[str, FloatArray]:
+        """(K + 1, R, O) inputs of a body's contact in trials by name,
+        those that move an obstacle in any trial.
+        """
         if not self.obstacles:
             return {}
-        acting = [name for name, values in contact_inputs(body, self.obstacles).items() if values.any()]
-        poses = {name: self._poses_at(motion, names, time_step) for name, motion in self.obstacles.items()}
+        acting = [
+            name for name, values in contact_inputs(body, self.obstacles).items() if values.any()
+        ]
+        poses = {
+            name: self._poses_at(motion, names, time_step)
+            for name, motion in self.obstacles.items()
+        }
         inputs = contact_inputs(body, poses)
         return {name: inputs[name] for name in acting}
 
@@ -294,26 +369,40 @@ class Trials(Brief):
             hung = payload_inputs(body, payload_at, self.payload[rows])
             acting |= {key: torch.from_numpy(masses) for key, masses in hung.items()}
         if static:
-            last = {key: acting[key] if self._is_constant(key) else acting[key][-1] for key in self.inputs}
+            last = {
+                key: acting[key] if self._is_constant(key) else acting[key][-1]
+                for key in self.inputs
+            }
             return Inputs(**acting), Inputs(**last)
         moved = self.contact_at(names, body, time_step)
         acting |= {name: torch.from_numpy(values[1:].copy()) for name, values in moved.items()}
         if (poses := self.base_at(names, time_step)) is not None:
-            fixed = torch.from_numpy(np.asarray(body.mesh.vertices[body.fixed_vertices], dtype=np.float64))
-            acting["fixed_positions"] = (fixed @ rotations(poses[1:, :, 3:]).mT) + poses[1:, :, None, :3]
+            fixed = torch.from_numpy(
+                np.asarray(body.mesh.vertices[body.fixed_vertices], dtype=np.float64)
+            )
+            acting["fixed_positions"] = (fixed @ rotations(poses[1:, :, 3:]).mT) + poses[
+                1:, :, None, :3
+            ]
         before = self.resting if self.begins[rows[0]] == UNDER_INPUTS else {}
-        return Inputs(**acting), Inputs(**{key: torch.from_numpy(values[rows]) for key, values in before.items()})
+        return Inputs(**acting), Inputs(
+            **{key: torch.from_numpy(values[rows]) for key, values in before.items()}
+        )
 
 
 def _of_trials(file: h5py.Group, name: str, count: int) -> FloatArray:
     """Reads an array (R, ...) of R trials."""
-    return read_array(file, name, (count, *[None] * (file[name].ndim - 1)) if name in file else None)
+    return read_array(
+        file, name, (count, *[None] * (file[name].ndim - 1)) if name in file else None
+    )
 
 
-def payload_inputs(body: Body, payload_at: Place | None, loads: FloatArray) -> dict[str, FloatArray]:
+def payload_inputs(
+    body: Body, payload_at: Place | None, loads: FloatArray
+) -> dict[str, FloatArray]:
     """Converts payloads to arguments of `Inputs` [kg].
 
-    The result is an (R, N) ``attached_mass``, in equal shares on the vertices that carry the payload.
+    The result is an (R, N) ``attached_mass``, in equal shares on the vertices that carry the
+    payload.
 
     Args:
         body: body that carries the payloads.
@@ -328,10 +417,16 @@ def payload_inputs(body: Body, payload_at: Place | None, loads: FloatArray) -> d
     if not np.any(loads):
         return {"attached_mass": masses}
     if payload_at is None:
-        raise InputError("a trial has a payload, but data.payload_at is not set: name the vertices that carry it.")
+        raise InputError(
+            "a trial has a payload, but data.payload_at is not set: "
+            "name the vertices that carry it."
+        )
     carrying = vertices_at(body.mesh, payload_at)
     if np.isin(carrying, body.fixed_vertices).all():
-        raise InputError("data.payload_at selects fixed vertices only: hang the payload on vertices that can move.")
+        raise InputError(
+            "data.payload_at selects fixed vertices only: "
+            "hang the payload on vertices that can move."
+        )
     masses[:, carrying] = loads[:, None] / len(carrying)
     return {"attached_mass": masses}
 

@@ -32,7 +32,8 @@ class BlockPattern:
         diagonal_vertex: (E,) vertex of a diagonal block, else -1.
         offsets: first cell block of each point set.
         n_cell_blocks: number of cell blocks of all point sets.
-        sliding_blocks: (T, 3) blocks of sliding vertices, and the projections of their row and column, or -1.
+        sliding_blocks: (T, 3) blocks of sliding vertices, and the projections of their row and
+            column, or -1.
     """
 
     def __init__(
@@ -52,7 +53,9 @@ class BlockPattern:
         self.n_cell_blocks = 0
         for points in sets:
             a, c = np.tril_indices(points.nodes.shape[1])
-            pair = np.stack([reduced[points.nodes[:, a]], reduced[points.nodes[:, c]]], axis=-1).reshape(-1, 2)
+            pair = np.stack(
+                [reduced[points.nodes[:, a]], reduced[points.nodes[:, c]]], axis=-1
+            ).reshape(-1, 2)
             # Padded nodes have a zero gradient.
             used = np.abs(points.gradients).sum(axis=(1, 3)) > 0.0
             keep = (pair >= 0).all(axis=1) & (used[:, a] & used[:, c]).ravel()
@@ -90,11 +93,14 @@ class HessianAssembly:
     """Recorded launches from the tangent of a potential to the value array of a linear solver.
 
     Attributes:
-        launches: launches that set ``values`` in the environments of the potential's ``tangent_active``.
+        launches: launches that set ``values`` in the environments of the potential's
+            ``tangent_active``.
         values: (B, n_values).
     """
 
-    def __init__(self, potential: IncrementalPotential, solver: LinearSolver, pattern: BlockPattern) -> None:
+    def __init__(
+        self, potential: IncrementalPotential, solver: LinearSolver, pattern: BlockPattern
+    ) -> None:
         p = potential
         self._potential = p
         active = warp_view(p.tangent_active, wp.int32)
@@ -128,11 +134,16 @@ class HessianAssembly:
             projected = p.upload(pattern.sliding_blocks.astype(np.int32), int)
             planes = warp_view(p.coordinates.projections, wp.mat33d)
             inputs = [active, projected, planes, p.upload(solver.address, int)]
-            commands.append(p.record(kernels.projection_kernel(scalar), (p.batch, count), inputs, [values]))
+            commands.append(
+                p.record(kernels.projection_kernel(scalar), (p.batch, count), inputs, [values])
+            )
         self.launches = p.capture(*commands)
 
     def __call__(self) -> torch.Tensor:
-        """Returns the values (B, n_values) for the potential's last `update_tangent`; the next call overwrites them."""
+        """Returns the values (B, n_values) for the potential's last `update_tangent`.
+
+        The next call overwrites them.
+        """
         p = self._potential
         if self._overwritten and p.all_active:
             self.values.zero_()

@@ -1,8 +1,9 @@
 """All energies of a simulator as one: quantities, terms of the incremental potential, and memory.
 
-An energy has its own names (``youngs_modulus``). If a simulator has several energies of a kind, such as the solids of
-two regions, their names in the simulator have a prefix (``tip_youngs_modulus``), which is added and removed only here.
-Mass damping is linear in the solution, so it is merged with inertia and target.
+An energy has its own names (``youngs_modulus``). If a simulator has several energies of a kind,
+such as the solids of two regions, their names in the simulator have a prefix
+(``tip_youngs_modulus``), which is added and removed only here. Mass damping is linear in the
+solution, so it is merged with inertia and target.
 """
 
 import math
@@ -34,12 +35,15 @@ from ..stepping.quantity import Quantity
 from ..stepping.state import Constants, ImplicitStage, Mass, State
 
 T = TypeVar("T")
-Materials = Mapping[str, Any]  # by name of a region or body: a material, or the materials of its regions
+# By name of a region or body: a material, or the materials of its regions.
+Materials = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class SimulatorStep:
-    """One time step of a simulator, or a static equilibrium after a state: a step without end (`endless`)."""
+    """One time step of a simulator, or a static equilibrium after a state:
+    a step without end (`endless`).
+    """
 
     state: State  # state at the start
     stage: ImplicitStage  # the implicit solve of the step
@@ -48,7 +52,9 @@ class SimulatorStep:
     terms: Sequence[Term]  # kernels of all energies for the state's batch
 
     @classmethod
-    def endless(cls, state: State, inputs: Inputs, constants: Constants, terms: Sequence[Term]) -> "SimulatorStep":
+    def endless(
+        cls, state: State, inputs: Inputs, constants: Constants, terms: Sequence[Term]
+    ) -> "SimulatorStep":
         """Returns a static equilibrium, in which inertia has no part."""
         return cls(state, ImplicitStage(math.inf, state.q, state.q, ()), inputs, constants, terms)
 
@@ -76,7 +82,8 @@ class EnergySet:
         inputs: inputs by name.
         defaults: default values of the parameters by name.
         counts: number of values of a parameter or an input per environment, by name.
-        parts: names of the parts, such as tendons, with one value each, by the name of the parameter.
+        parts: names of the parts, such as tendons, with one value each, by the name of the
+            parameter.
         memory: memory variables by name.
         internal: resultants of internal forces.
     """
@@ -101,14 +108,19 @@ class EnergySet:
         self.memory: dict[str, Memory] = {}
         for item in placed:
             energy, prefix, points = item.energy, item.prefix, item.all_points or item.points
-            bound = energy.bind(EnergySite(item.body or body, item.first, points, rest_positions, method, time_step))
+            bound = energy.bind(
+                EnergySite(item.body or body, item.first, points, rest_positions, method, time_step)
+            )
             self._bound.append(bound)
             parameters, inputs = (
                 {f"{prefix}{q.name}": replace(q, name=f"{prefix}{q.name}") for q in quantities}
                 for quantities in (energy.parameters, energy.inputs)
             )
             if duplicates := {*parameters, *inputs} & {*self.parameters, *self.inputs}:
-                raise InputError(f"two energies depend on {min(duplicates)}: rename one of their bodies or regions.")
+                raise InputError(
+                    f"two energies depend on {min(duplicates)}: "
+                    "rename one of their bodies or regions."
+                )
             self.parameters |= parameters
             self.inputs |= inputs
             self.defaults |= {f"{prefix}{name}": value for name, value in energy.defaults.items()}
@@ -116,35 +128,58 @@ class EnergySet:
                 self.counts[f"{prefix}{q.name}"] = energy.count_of(q)
                 if energy.names and energy.count_of(q) == energy.count:
                     self.parts[f"{prefix}{q.name}"] = energy.names
-            self.memory |= {f"{prefix}{m.name}": replace(m, name=f"{prefix}{m.name}") for m in bound.memory}
+            self.memory |= {
+                f"{prefix}{m.name}": replace(m, name=f"{prefix}{m.name}") for m in bound.memory
+            }
         self._loading, self._stepping, self._posing, self._holding = (
-            [k for k, bound in enumerate(self._bound) if getattr(type(bound), name) is not getattr(BoundEnergy, name)]
+            [
+                k
+                for k, bound in enumerate(self._bound)
+                if getattr(type(bound), name) is not getattr(BoundEnergy, name)
+            ]
             for name in ("load", "begin_step", "at_pose", "load_at_fixed")
         )
         self._remembering = [k for k, bound in enumerate(self._bound) if bound.memory]
-        self._rate_independent = [k for k, bound in enumerate(self._bound) if bound.rate_independent]
+        self._rate_independent = [
+            k for k, bound in enumerate(self._bound) if bound.rate_independent
+        ]
 
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> tuple[list[Values], Mass]:
-        """Returns the values of every energy that follow from the parameters, by name, and the mass of the body."""
+        """Returns the values of every energy that follow from the parameters,
+        by name, and the mass of the body.
+        """
         split = [_without(item.prefix, parameters) for item in self.placed]
-        values: list[Values] = [bound.prepare(mine) for bound, mine in zip(self._bound, split, strict=True)]
-        masses = [mass for bound, mine in zip(self._bound, split, strict=True) if (mass := bound.mass(mine))]
+        values: list[Values] = [
+            bound.prepare(mine) for bound, mine in zip(self._bound, split, strict=True)
+        ]
+        masses = [
+            mass
+            for bound, mine in zip(self._bound, split, strict=True)
+            if (mass := bound.mass(mine))
+        ]
         return values, masses[0] if len(masses) == 1 else Mass.sum(masses)
 
-    def _values(self, step: SimulatorStep, share: float = 1.0) -> list[dict[str, torch.Tensor | None]]:
-        """Returns the values of every energy that follow from parameters and inputs; missing inputs are zero.
+    def _values(
+        self, step: SimulatorStep, share: float = 1.0
+    ) -> list[dict[str, torch.Tensor | None]]:
+        """Returns the values of every energy that follow from parameters and inputs.
+
+        Missing inputs are zero.
 
         Args:
             step: the step.
             share: factor of the inputs.
         """
-        values, actuation = [dict(prepared) for prepared in step.constants.values], step.inputs.actuation
+        values = [dict(prepared) for prepared in step.constants.values]
+        actuation = step.inputs.actuation
         for energy_values, item in zip(values, self.placed, strict=True):
             for quantity in item.energy.inputs:
                 name = f"{item.prefix}{quantity.name}"
                 zero = step.constants.gravity.new_zeros
                 if name in actuation:
-                    energy_values[quantity.name] = actuation[name] if share == 1.0 else share * actuation[name]
+                    energy_values[quantity.name] = (
+                        actuation[name] if share == 1.0 else share * actuation[name]
+                    )
                 else:
                     energy_values[quantity.name] = zero(step.state.batch, self.counts[name])
         return values
@@ -156,15 +191,17 @@ class EnergySet:
             state = replace(state, memory=_without(prefix, state.memory))
         fixed = None if prefix else step.inputs.fixed_positions
         inputs = _without(prefix, step.inputs.actuation)
-        return EnergyStep(state, step.stage, inputs, fixed, constants.values[k], constants.gravity, step.terms[k])
+        return EnergyStep(
+            state, step.stage, inputs, fixed, constants.values[k], constants.gravity, step.terms[k]
+        )
 
     def step_terms(self, step: SimulatorStep, near: torch.Tensor | None = None) -> StepTerms:
         """Returns the terms of a step, differentiable.
 
         Args:
             step: the step.
-            near: (B, N, 3) positions of forces that depend on the pose (`internal_force`); without, those without
-                forces [m].
+            near: (B, N, 3) positions of forces that depend on the pose (`internal_force`); without,
+                those without forces [m].
         """
         batch, h, constants, stage = step.state.batch, step.stage.step, step.constants, step.stage
         damping = constants.mass_damping[..., None] * h  # (1 or B, 1, 1)
@@ -179,29 +216,42 @@ class EnergySet:
         if self._coordinates.depends:  # their inertia is the last energy (`place_energies`)
             dependent = self._coordinates.dependent
             values[-1] |= {"inertia": inertia[:, dependent], "target": target[:, dependent]}
-        return StepTerms(target, inertia, self._coordinates.reduce(force.expand(batch, -1, -1)), values)
+        return StepTerms(
+            target, inertia, self._coordinates.reduce(force.expand(batch, -1, -1)), values
+        )
 
-    def rest_terms(self, step: SimulatorStep, share: float, near: torch.Tensor | None = None) -> StepTerms:
+    def rest_terms(
+        self, step: SimulatorStep, share: float, near: torch.Tensor | None = None
+    ) -> StepTerms:
         """Returns the terms of a static equilibrium under a fraction of all loads, differentiable.
 
         Args:
-            step: the equilibrium after a state, whose memory friction continues, and whose positions and forces that of
-                contact; its inputs are constant.
+            step: the equilibrium after a state, whose memory friction continues, and whose
+                positions and forces that of contact; its inputs are constant.
             share: the fraction.
-            near: (B, N, 3) positions of forces that depend on the pose; without, these are left out [m].
+            near: (B, N, 3) positions of forces that depend on the pose; without, these are left out
+                [m].
         """
         state, batch = step.state, step.state.batch
         values = self._values(step, share)
         for k, bound in enumerate(self._bound):
-            values[k] |= bound.begin_step(self._step(step, k)) if bound.rate_independent else bound.at_rest(batch)
+            values[k] |= (
+                bound.begin_step(self._step(step, k))
+                if bound.rate_independent
+                else bound.at_rest(batch)
+            )
         if near is not None:
             for k in self._posing:
                 values[k] |= self._bound[k].at_pose(near, values[k])
         force = self._coordinates.reduce(self._loads(step, near).expand(batch, -1, -1))
         return StepTerms(state.q, state.q.new_zeros(state.q.shape[:2]), share * force, values)
 
-    def internal_force(self, step: SimulatorStep, q: torch.Tensor | None = None) -> torch.Tensor | None:
-        """Returns the internal force (B, N, 3) of a step, balanced at q (B, N, 3) or without forces, or None [N]."""
+    def internal_force(
+        self, step: SimulatorStep, q: torch.Tensor | None = None
+    ) -> torch.Tensor | None:
+        """Returns the internal force (B, N, 3) of a step,
+        balanced at q (B, N, 3) or without forces, or None [N].
+        """
         force, mass = step.inputs.internal_force, step.constants.mass
         if force is None or not self.depends_on_pose(step):
             return force
@@ -210,11 +260,13 @@ class EnergySet:
         return self.internal.balanced(force, step.stage.target if q is None else q, mass)
 
     def depends_on_pose(self, step: SimulatorStep) -> bool:
-        """Whether the internal force of a step depends on the pose at its end, as of a body that nothing holds."""
+        """Whether the internal force of a step depends on the pose at its end,
+        as of a body that nothing holds.
+        """
         return self.internal.follow_pose(step.inputs.internal_force)
 
     def _loads(self, step: SimulatorStep, near: torch.Tensor | None) -> torch.Tensor:
-        """Returns the dead loads (1 or B, N, 3): gravity, forces of the inputs and those of the energies [N]."""
+        """The dead loads (1 or B, N, 3): gravity, forces of inputs and those of energies [N]."""
         constants, inputs, mass = step.constants, step.inputs, step.constants.load_mass
         if inputs.attached_mass is not None:
             mass = mass + inputs.attached_mass
@@ -228,18 +280,25 @@ class EnergySet:
         return sum((load for load in loads if load is not None), start=force)
 
     def loads_at_fixed(self, terms: StepTerms, q: torch.Tensor) -> torch.Tensor | None:
-        """Returns what forces (B, N, 3) at fixed vertices have beyond the energies' slopes at q (B, N, 3), or None."""
+        """Returns what forces (B, N, 3) at fixed vertices have beyond the energies' slopes
+        at q (B, N, 3), or None.
+        """
         loads = (self._bound[k].load_at_fixed(q, terms.values[k]) for k in self._holding)
         found = [load for load in loads if load is not None]
         return sum(found[1:], found[0]) if found else None
 
     @property
     def follow_pose(self) -> bool:
-        """Whether forces in a static equilibrium depend on its pose without a potential, as friction of tendons."""
+        """Whether forces in a static equilibrium depend on its pose without a potential,
+        as friction of tendons.
+        """
         return bool(self._posing)
 
-    def end_step(self, step: SimulatorStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Returns the memory variables after a step with solution x and final positions q, (B, N, 3) each.
+    def end_step(
+        self, step: SimulatorStep, x: torch.Tensor, q: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        """Returns the memory variables after a step with solution x
+        and final positions q, (B, N, 3) each.
 
         After a static equilibrium these are the ones of energies without rate.
         """
@@ -250,7 +309,9 @@ class EnergySet:
         return memory
 
     def contacts(self, step: SimulatorStep, x: torch.Tensor) -> dict[str, ContactForces]:
-        """Returns the contact of a step with solution x (B, N, 3) by name (`Simulator.contacts`)."""
+        """Returns the contact of a step with solution x (B, N, 3)
+        by name (`Simulator.contacts`).
+        """
         out: dict[str, ContactForces] = {}
         for k, bound in enumerate(self._bound):
             if isinstance(bound, BoundContact | BoundSurfaceContact):
@@ -261,13 +322,16 @@ class EnergySet:
     @cached_property
     def obstacle_names(self) -> frozenset[str]:
         """Names of all obstacles."""
-        return frozenset(name for item in self.placed for name in getattr(item.energy, "obstacles", ()))
+        return frozenset(
+            name for item in self.placed for name in getattr(item.energy, "obstacles", ())
+        )
 
     def obstacles(self, states: Sequence[State], constants: Constants) -> tuple[Pose, ...]:
         """Returns the poses of all obstacles in each state; none without obstacles.
 
         Args:
-            states: successive states of a roll-out, whose memory has the poses of obstacles that move.
+            states: successive states of a roll-out, whose memory has the poses of obstacles that
+                move.
             constants: constants of the simulator.
         """
         contacts: list[list[Pose]] = []
@@ -278,12 +342,13 @@ class EnergySet:
         return tuple(Pose.joined(poses) for poses in zip(*contacts, strict=True))
 
     def outside(self, q: torch.Tensor, state: State, constants: Constants) -> torch.Tensor:
-        """Returns positions (B, N, 3) [m] pushed out of obstacles that stand still, for a step from there.
+        """Returns positions (B, N, 3) [m] pushed out of obstacles
+        that stand still, for a step from there.
 
         Args:
             q: positions, of which some may be within an obstacle.
-            state: nearby, out of all obstacles: vertices are pushed to their gap in it, or to half of the distance at
-                which contact begins, whichever is less.
+            state: nearby, out of all obstacles: vertices are pushed to their gap in it, or to half
+                of the distance at which contact begins, whichever is less.
             constants: constants of the simulator.
 
         Raises:
@@ -294,21 +359,29 @@ class EnergySet:
                 q = bound.outside(q, state, values)
         return q
 
-    def check_memory(self, memory: Mapping[str, torch.Tensor], batch: int, like: torch.Tensor) -> None:
-        """Raises InputError for an unknown memory variable, a wrong shape or dtype, or values that are not finite."""
+    def check_memory(
+        self, memory: Mapping[str, torch.Tensor], batch: int, like: torch.Tensor
+    ) -> None:
+        """Raises InputError for an unknown memory variable,
+        a wrong shape or dtype, or values that are not finite.
+        """
         for name, values in memory.items():
             if "." in name:  # of a robot
                 continue
             if name not in self.memory:
                 names = ", ".join(self.memory) or "nothing"
                 raise InputError(
-                    f"Unknown memory {name!r} of the state. The energies of this body remember {names}; leave it out."
+                    f"Unknown memory {name!r} of the state. The energies of this body remember "
+                    f"{names}; leave it out."
                 )
             self.memory[name].check(values, batch, like)
 
 
 def joined_names(materials: Material | Materials) -> dict[str, Material]:
-    """Returns materials of bodies and regions by joined names, as ``finger_tip``; a single one has an empty name."""
+    """Returns materials of bodies and regions by joined names, as ``finger_tip``.
+
+    A single one has an empty name.
+    """
     if isinstance(materials, Material):
         return {"": materials}
     return {
@@ -333,9 +406,14 @@ def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEn
     for name, body, first in whole.members:
         prefix = f"{name}_" if name else ""
         solids = solids_of(body, _material_of(material, body, name))
-        energies: list[tuple[Energy, str]] = [(solid, f"{prefix}{region}") for solid, region in solids]
+        energies: list[tuple[Energy, str]] = [
+            (solid, f"{prefix}{region}") for solid, region in solids
+        ]
         for part in body.controls:
-            energies += [(energy, f"{prefix}{part}_") for energy in rigid_energies(body, part, body.rigid[part])]
+            energies += [
+                (energy, f"{prefix}{part}_")
+                for energy in rigid_energies(body, part, body.rigid[part])
+            ]
         items: list[tuple[Energy, Any, str]] = [
             (energy, energy.points(body.mesh), region_prefix) for energy, region_prefix in energies
         ]
@@ -357,6 +435,9 @@ def _material_of(material: Material | Materials, body: Body, name: str) -> Mater
     if name not in material:
         if body.soft_cells is not None and not len(body.soft_cells):
             return {}
-        raise InputError(f"The body {name!r} has no material. Give one: there are {', '.join(material) or 'none'}.")
+        raise InputError(
+            f"The body {name!r} has no material. Give one: there are "
+            f"{', '.join(material) or 'none'}."
+        )
     chosen: Material | Materials = material[name]
     return chosen

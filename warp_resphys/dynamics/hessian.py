@@ -21,8 +21,8 @@ class HessianApproximation(ABC):
     """A factorised approximation of the potential's Hessian.
 
     Attributes:
-        clamped: (B,) environments whose matrix is positive definite by clamping or by construction; if a line search
-            fails with it, the solve has failed.
+        clamped: (B,) environments whose matrix is positive definite by clamping or by construction;
+            if a line search fails with it, the solve has failed.
         vertex_at: (F,) free vertices in the order of the right-hand sides of `solve_in_place`.
     """
 
@@ -34,12 +34,15 @@ class HessianApproximation(ABC):
         """Whether there is a factor that can be used for the current terms."""
 
     @abstractmethod
-    def refactor(self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None) -> None:
+    def refactor(
+        self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None
+    ) -> None:
         """Factorises at the potential's positions.
 
         Args:
             clamp: (B,) environments with eigenvalues clamped; None: no environment.
-            active: (B,) environments that get a new factor; the others keep theirs, if any. None: all.
+            active: (B,) environments that get a new factor; the others keep theirs, if any. None:
+                all.
         """
 
     @abstractmethod
@@ -48,7 +51,8 @@ class HessianApproximation(ABC):
 
     @abstractmethod
     def solve_in_place(self, right: torch.Tensor, needed: torch.Tensor) -> None:
-        """Overwrites residuals (B, F, 3) [N] at the free vertices, ordered as `vertex_at`, with displacements [m].
+        """Overwrites residuals (B, F, 3) [N] at the free vertices,
+        ordered as `vertex_at`, with displacements [m].
 
         Args:
             right: the residuals.
@@ -68,12 +72,14 @@ class ExactHessian(HessianApproximation):
         linear: the solver.
         assembly: assembly in the solver's layout.
         exact: whether factors are in float64.
-        kept: solves by the factor of an earlier state, or None where energies couple vertices of many cells, and for
-            linear solvers whose factors are cheap.
+        kept: solves by the factor of an earlier state, or None where energies couple vertices of
+            many cells, and for linear solvers whose factors are cheap.
         couplings: second derivatives of pairs as matrices of the unknowns.
     """
 
-    def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
+    def __init__(
+        self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver
+    ) -> None:
         self._potential, self.linear = potential, linear
         self.exact = linear.dtype == torch.float64
         self.assembly = HessianAssembly(potential, linear, pattern)
@@ -94,7 +100,9 @@ class ExactHessian(HessianApproximation):
         return self._factor is not None
 
     @override
-    def refactor(self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None) -> None:
+    def refactor(
+        self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None
+    ) -> None:
         clamp = torch.zeros_like(self.clamped) if clamp is None else clamp
         self.clamped.copy_(clamp if active is None else torch.where(active, clamp, self.clamped))
         self._factorise(active)
@@ -111,7 +119,9 @@ class ExactHessian(HessianApproximation):
         self._potential.update_tangent(self.clamped, active)
         values, columns = self.assembly(), self._columns()
         factor = self.linear.factor if self._potential.has_pairs else self.linear.direction_factor
-        self._factor = factor(values, columns=columns, idle=None if active is None else ~active, before=self._factor)
+        self._factor = factor(
+            values, columns=columns, idle=None if active is None else ~active, before=self._factor
+        )
         if self._corotation is not None:
             self._corotation.record(active)
         if self._coupled is not None:
@@ -146,7 +156,11 @@ class ExactHessian(HessianApproximation):
         else:
             self._corotation.solve_in_place(self._factor, right)
         if self._potential.has_pairs:
-            self._correct(self._potential.pair_tangents(True, needed), right.flatten(1)[:, :, None], self.linear.dofs)
+            self._correct(
+                self._potential.pair_tangents(True, needed),
+                right.flatten(1)[:, :, None],
+                self.linear.dofs,
+            )
 
     def _correct(self, parts: Sequence[PairTangents], x: torch.Tensor, order: torch.Tensor) -> None:
         """Adds the coupling of pairs to solutions (B, n, k) without it."""
@@ -159,35 +173,48 @@ class ExactHessian(HessianApproximation):
         self._coupled.correct(self._factor, couplings, x, order)
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
-        """Returns solutions (B, 3 N, m) for right-hand sides (B, 3 N, m), zero at fixed vertices."""
+        """Returns solutions (B, 3 N, m) for right-hand sides (B, 3 N, m),
+        zero at fixed vertices.
+        """
         if self._factor is None:
             raise RuntimeError("refactor before solve")
         out = torch.zeros_like(right)
         x = self._factor.solve(right[:, self._dofs].to(self.linear.dtype))
         if self._potential.has_pairs:
-            self._correct(self._potential.last_pair_tangents, x, torch.arange(x.shape[1], device=x.device))
+            self._correct(
+                self._potential.last_pair_tangents, x, torch.arange(x.shape[1], device=x.device)
+            )
         out[:, self._dofs] = x.to(right.dtype)
         return out
 
 
 class ProjectiveHessian(HessianApproximation):
-    """Inertia plus ``(2 mu + lambda) V G G^T`` at every point of the solid, identical for each coordinate.
+    """Inertia plus ``(2 mu + lambda) V G G^T`` at every point of the solid,
+    identical for each coordinate.
 
     Fibres and tendons contribute their stiffness, pressure does not contribute.
 
-    This is the Hessian of the distances to fixed projections (Bouaziz et al. 2014, equation 10). It does not depend on
-    the positions: a factor is valid until inertia or stiffness change, for the whole batch if these are shared.
+    This is the Hessian of the distances to fixed projections (Bouaziz et al. 2014, equation 10). It
+    does not depend on the positions: a factor is valid until inertia or stiffness change, for the
+    whole batch if these are shared.
     """
 
-    def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
+    def __init__(
+        self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver
+    ) -> None:
         self._potential, self._pattern, self._linear = potential, pattern, linear
         self.vertex_at = pattern.free
-        self._address = torch.as_tensor(linear.address[:, 0], device=potential.device, dtype=torch.int64)
-        self._products = list[torch.Tensor]()  # (C, Q, pairs) of the gradients of every node pair a >= c of a cell
+        self._address = torch.as_tensor(
+            linear.address[:, 0], device=potential.device, dtype=torch.int64
+        )
+        # (C, Q, pairs) of the gradients of every node pair a >= c of a cell
+        self._products = list[torch.Tensor]()
         for gradients in (s.source.gradients for s in potential.sets):
             a, c = np.tril_indices(gradients.shape[2])
             products = np.einsum("cqpi,cqpi->cqp", gradients[:, :, a], gradients[:, :, c])
-            self._products.append(torch.as_tensor(products, device=potential.device, dtype=torch.float64))
+            self._products.append(
+                torch.as_tensor(products, device=potential.device, dtype=torch.float64)
+            )
         self._key: tuple[torch.Tensor, ...] | None = None
         self.clamped = torch.ones(potential.batch, dtype=torch.bool, device=potential.device)
         self._factor: Factor | None = None
@@ -195,7 +222,9 @@ class ProjectiveHessian(HessianApproximation):
     def _terms(self) -> tuple[torch.Tensor, ...]:
         p = self._potential
         curvatures = ((term.curvature(), term.sets) for term in p.energies)
-        return p.terms.inertia, *(values[:, s.in_energy] for values, sets in curvatures for s in sets)
+        return p.terms.inertia, *(
+            values[:, s.in_energy] for values, sets in curvatures for s in sets
+        )
 
     @override
     def ready(self) -> bool:
@@ -203,7 +232,9 @@ class ProjectiveHessian(HessianApproximation):
         return self._key is not None and all(map(torch.equal, self._key, terms))
 
     @override
-    def refactor(self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None) -> None:
+    def refactor(
+        self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None
+    ) -> None:
         del clamp, active  # The matrix is positive definite and the same for later steps.
         self._key = tuple(t.clone() for t in self._terms())
         inertia, *weights = (t[:1] if bool((t == t[:1]).all()) else t for t in self._key)
@@ -217,7 +248,9 @@ class ProjectiveHessian(HessianApproximation):
         source = torch.where(source < 0, -1 - source, source)
         counts = torch.as_tensor(np.diff(self._pattern.start), device=blocks.device)
         # Sums in a fixed order, unlike index_add_ on a GPU.
-        sums = torch.segment_reduce(blocks[:, source].mT.contiguous(), "sum", lengths=counts, axis=0)
+        sums = torch.segment_reduce(
+            blocks[:, source].mT.contiguous(), "sum", lengths=counts, axis=0
+        )
         values = torch.zeros(batch, self._linear.n_values, device=blocks.device, dtype=blocks.dtype)
         values[:, self._address] = sums.mT
         diagonal = torch.as_tensor(self._pattern.rows == self._pattern.cols, device=blocks.device)

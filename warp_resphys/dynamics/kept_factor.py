@@ -1,9 +1,10 @@
 """Solutions with the factor of an earlier state, and when to make a new one.
 
-The Hessian H of a state is solved by conjugate gradients, preconditioned with the factor of an earlier Hessian that has
-rotated with the body (`corotation`). A factor takes as long as some 25 iterations. With k solutions of n_1, ..., n_k
-iterations since the last factor, a solution costs (25 + n_1 + ... + n_k) / k iterations on average, which falls as long
-as the last one is below this mean: the factor is replaced as soon as it is not.
+The Hessian H of a state is solved by conjugate gradients, preconditioned with the factor of an
+earlier Hessian that has rotated with the body (`corotation`). A factor takes as long as some 25
+iterations. With k solutions of n_1, ..., n_k iterations since the last factor, a solution costs
+(25 + n_1 + ... + n_k) / k iterations on average, which falls as long as the last one is below this
+mean: the factor is replaced as soon as it is not.
 """
 
 from collections.abc import Sequence
@@ -30,9 +31,10 @@ _FACTOR: Final = 25  # iterations that take as long as a new factor
 class Corotation:
     """Rotations of a batch since its last factors; none of vertices in symmetry planes.
 
-    The Hessian of a body that has only been rotated is R H R^T, with the rotation R in the block of every vertex.
-    With R of the mean deformation gradient around each vertex, R H^-1 R^T is close to the inverse also where a body
-    bends: fewer iterations need the factor of an earlier state, and it lasts for longer.
+    The Hessian of a body that has only been rotated is R H R^T, with the rotation R in the block of
+    every vertex. With R of the mean deformation gradient around each vertex, R H^-1 R^T is close to
+    the inverse also where a body bends: fewer iterations need the factor of an earlier state, and
+    it lasts for longer.
 
     Args:
         potential: the potential, whose positions are used.
@@ -51,25 +53,51 @@ class Corotation:
             warp_view(x, wp.mat33d) for x in (self._sum, self._rotation, self._before, self._since)
         )
         positions, commands = warp_view(p.positions, wp.vec3d), []
-        solids = [(s, s.source) for s in p.sets if isinstance(s.source, SolidPoints) and s.source.shape_volume.nnz]
-        mean = sum(source.shape_volume.sum() / s.cells for s, source in solids) / max(1, len(solids))
+        solids = [
+            (s, s.source)
+            for s in p.sets
+            if isinstance(s.source, SolidPoints) and s.source.shape_volume.nnz
+        ]
+        mean = sum(source.shape_volume.sum() / s.cells for s, source in solids) / max(
+            1, len(solids)
+        )
         for s, source in solids:
-            volumes = np.asarray(source.shape_volume.sum(axis=1)).reshape(s.cells, s.points_per_cell)
-            operators = p.upload(np.einsum("cq,cqki->cki", volumes / mean, source.gradients), wp.vec3d)
+            volumes = np.asarray(source.shape_volume.sum(axis=1)).reshape(
+                s.cells, s.points_per_cell
+            )
+            operators = p.upload(
+                np.einsum("cq,cqki->cki", volumes / mean, source.gradients), wp.vec3d
+            )
             gradient = warp_view(p.zeros(s.cells, 3, 3), wp.mat33d)
             commands += [
-                p.record(kernels.cell_gradients, (p.batch, s.cells), [s.points, operators, positions], [gradient]),
-                p.record(kernels.sum_at_vertices, shape, [s.start, s.incident, s.nodes_per_cell, gradient], [total]),
+                p.record(
+                    kernels.cell_gradients,
+                    (p.batch, s.cells),
+                    [s.points, operators, positions],
+                    [gradient],
+                ),
+                p.record(
+                    kernels.sum_at_vertices,
+                    shape,
+                    [s.start, s.incident, s.nodes_per_cell, gradient],
+                    [total],
+                ),
             ]
         slides = np.zeros(shape[1], dtype=np.int32)
         slides[p.coordinates.sliding.cpu().numpy()] = 1
-        commands.append(p.record(kernels.rotation, shape, [p.upload(slides, int), total], [rotation]))
+        commands.append(
+            p.record(kernels.rotation, shape, [p.upload(slides, int), total], [rotation])
+        )
         inputs = [p.upload(vertices.astype(np.int32), int), before, rotation]
         self._compute = p.capture(*commands)
-        self._compare = p.capture(p.record(kernels.rotation_since, (p.batch, len(vertices)), inputs, [since]))
+        self._compare = p.capture(
+            p.record(kernels.rotation_since, (p.batch, len(vertices)), inputs, [since])
+        )
 
     def record(self, active: torch.Tensor | None = None) -> None:
-        """Records the rotations at the potential's positions as those of new factors of environments (B,), or all."""
+        """Records the rotations at the potential's positions as those of new factors of
+        environments (B,), or all.
+        """
         self._compute_rotations()
         now = self._rotation[:, self.vertices]
         active = torch.ones_like(now[:, 0, 0, 0], dtype=torch.bool) if active is None else active
@@ -111,15 +139,22 @@ class KeptFactor:
     """
 
     def __init__(
-        self, potential: IncrementalPotential, assembly: HessianAssembly, linear: LinearSolver, corotation: Corotation
+        self,
+        potential: IncrementalPotential,
+        assembly: HessianAssembly,
+        linear: LinearSolver,
+        corotation: Corotation,
     ) -> None:
         self._potential, self._assembly, self._linear = potential, assembly, linear
         self._corotation = corotation
         self._factor: Factor | None = None
-        self._solutions = self._iterations = 0  # with this factor, which counts as `_FACTOR` iterations
+        self._solutions = self._iterations = (
+            0  # with this factor, which counts as `_FACTOR` iterations
+        )
 
     def solve(self, rights: Sequence[torch.Tensor]) -> list[torch.Tensor] | None:
-        """Returns solutions (B, N, 3) for right-hand sides, or None if the Hessian is not positive definite.
+        """Returns solutions (B, N, 3) for right-hand sides,
+        or None if the Hessian is not positive definite.
 
         Their last digits depend on which factor is kept, and so on earlier solutions.
         """
@@ -139,7 +174,9 @@ class KeptFactor:
         for renews in (True,) if self._factor is None else (False, True):
             if renews and not self._renew():
                 return None
-            iterate = conjugate_gradients(self._product, self._precondition, right, _EXACT, _MOST_ITERATIONS)
+            iterate = conjugate_gradients(
+                self._product, self._precondition, right, _EXACT, _MOST_ITERATIONS
+            )
             if bool(iterate.converged.all()):
                 self._solutions += 1
                 self._iterations += iterate.iterations

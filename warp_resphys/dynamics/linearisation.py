@@ -1,4 +1,6 @@
-"""Residual of a step and its exact derivative at any positions, for other methods than the simulator's solvers."""
+"""Residual of a step and its exact derivative at any positions,
+for other methods than the simulator's solvers.
+"""
 
 import math
 from dataclasses import replace
@@ -25,7 +27,8 @@ _MOST_COLUMNS = 4  # right-hand sides up to which a factor of another state may 
 class Linearisation:
     """The residual g(x) of a step and its Hessian H = dg/dx.
 
-    It uses the buffers of a batch, and is valid until the simulator is used again for a batch of that size.
+    It uses the buffers of a batch, and is valid until the simulator is used again for a batch of
+    that size.
 
     Args:
         problem: a time step or a static equilibrium.
@@ -38,9 +41,17 @@ class Linearisation:
     """
 
     def __init__(self, problem: TimeStep) -> None:
-        equations, self._workspace, self._terms = problem.equations, problem.workspace, problem.terms()
+        equations, self._workspace, self._terms = (
+            problem.equations,
+            problem.workspace,
+            problem.terms(),
+        )
         self._reaction = problem.reaction
-        self.stage, self.finish, self._name = problem.step.stage, problem.finish, equations.settings.linear_solver
+        self.stage, self.finish, self._name = (
+            problem.step.stage,
+            problem.finish,
+            equations.settings.linear_solver,
+        )
         self._fixed_positions, self._coordinates = problem.fixed_positions(), equations.coordinates
         self.start = self.hold(self.stage.target)
         self._potential = self._workspace.potential
@@ -50,12 +61,16 @@ class Linearisation:
         self._at, self._has_factor = self.start, True
 
     def hold(self, x: torch.Tensor) -> torch.Tensor:
-        """Returns x with fixed and dependent vertices in their places, and sliding vertices in their planes."""
+        """Returns x with fixed and dependent vertices in their places,
+        and sliding vertices in their planes.
+        """
         held = self._coordinates.hold(x.index_copy(1, self._workspace.fixed, self._fixed_positions))
         return self._coordinates.expand(held)
 
     def residual(self, x: torch.Tensor) -> torch.Tensor:
-        """Returns g (B, N, 3) at x [N], zero at fixed vertices: the additional force for which x solves the step."""
+        """Returns g (B, N, 3) at x [N], zero at fixed vertices:
+        the additional force for which x solves the step.
+        """
         self._potential.positions.copy_(x)
         self._potential.evaluate()
         return self._potential.residual.clone()
@@ -65,7 +80,8 @@ class Linearisation:
 
         Args:
             x: (B, N, 3) [m].
-            missing: whether the force with which x solves the step (`residual`) acts within the body or on it.
+            missing: whether the force with which x solves the step (`residual`) acts within the
+                body or on it.
         """
         force = _Residual.apply(self, x) if missing == "internal" else None
         self._potential.positions.copy_(x.detach())
@@ -74,7 +90,9 @@ class Linearisation:
         return replace(self.finish(x), reaction=self._reaction(self._terms, x, gradient, force))
 
     def factorise(self, x: torch.Tensor) -> None:
-        """Prepares H at x (B, N, 3) [m] for `product` and `solve`, which makes an expensive factor if it needs one."""
+        """Prepares H at x (B, N, 3) [m] for `product` and `solve`,
+        which makes an expensive factor if it needs one.
+        """
         hessian = self._workspace.hessian(self._name)
         self._at, self._has_factor = x.detach().clone(), hessian.kept is None
         if hessian.kept is not None:
@@ -85,7 +103,9 @@ class Linearisation:
             hessian.refactor_exact()
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
-        """Returns the solutions (B, 3 N, m) of H y = r for (B, 3 N, m) right-hand sides, zero at fixed vertices."""
+        """Returns the solutions (B, 3 N, m) of H y = r for (B, 3 N, m) right-hand sides,
+        zero at fixed vertices.
+        """
         hessian = self._workspace.hessian(self._name)
         fields = self._coordinates.restrict(self._coordinates.reduce(right.unflatten(1, (-1, 3))))
         with threads_for(self._unknowns):
@@ -93,7 +113,9 @@ class Linearisation:
             if hessian.kept is not None and not self._has_factor:
                 self._potential.positions.copy_(self._at)
                 if 0 < fields.shape[3] <= _MOST_COLUMNS:
-                    columns = [self._potential.restrict(column) for column in fields.double().unbind(3)]
+                    columns = [
+                        self._potential.restrict(column) for column in fields.double().unbind(3)
+                    ]
                     if (solutions := hessian.kept.solve(columns)) is not None:
                         solution = torch.stack(solutions, 3).to(fields)
                 if solution is None:
@@ -129,13 +151,17 @@ class Linearisation:
         """
         factor = self._shift(scale)
         if factor.failed.any():
-            self._potential.update_tangent(torch.as_tensor(factor.failed, device=self._potential.device))
+            self._potential.update_tangent(
+                torch.as_tensor(factor.failed, device=self._potential.device)
+            )
             factor = self._shift(scale)
             self._potential.update_tangent()
         return factor
 
     def matrix(self, x: torch.Tensor) -> tuple[scipy.sparse.csc_array, NDArray[np.float64]]:
-        """Returns H (3 F, 3 F) of the first environment on the free vertices, and the inertia (3 F,) in it [N/m]."""
+        """Returns H (3 F, 3 F) of the first environment on the free vertices,
+        and the inertia (3 F,) in it [N/m].
+        """
         p, pattern = self._potential, self._workspace.pattern
         self.update(x)
         matrix = self._shift.linear.matrix(self._shift.assemble()[0])
@@ -149,7 +175,9 @@ class Linearisation:
                 at = coupling.unknowns[number][used].cpu().numpy()
                 block = coupling.matrices[number][used][:, used].cpu().numpy()
                 pairs = (block.ravel(), (np.repeat(at, len(at)), np.tile(at, len(at))))
-                matrix = scipy.sparse.csc_array(matrix + scipy.sparse.coo_array(pairs, matrix.shape))
+                matrix = scipy.sparse.csc_array(
+                    matrix + scipy.sparse.coo_array(pairs, matrix.shape)
+                )
         return matrix, np.repeat(p.inertia[0].cpu().numpy()[pattern.free], 3)
 
     def inertia_matrix(self, x: torch.Tensor) -> scipy.sparse.csc_array:
@@ -158,17 +186,25 @@ class Linearisation:
         if not len(self._coordinates.dependent):
             return scipy.sparse.csc_array(scipy.sparse.diags_array(diagonal))
         still = [
-            {name: v * 0.0 if v is not None and name == "inertia" else v for name, v in values.items()}
+            {
+                name: v * 0.0 if v is not None and name == "inertia" else v
+                for name, v in values.items()
+            }
             for values in self._terms.values
         ]
-        self._potential.set_terms(replace(self._terms, inertia=0.0 * self._terms.inertia, values=still))
+        self._potential.set_terms(
+            replace(self._terms, inertia=0.0 * self._terms.inertia, values=still)
+        )
         elastic, _ = self.matrix(x)
         self._potential.set_terms(self._terms)
         return scipy.sparse.csc_array(whole - elastic)
 
 
 class _Residual(AdjointFunction):
-    """The residual g (B, N, 3) of a linearised step at x (B, N, 3); dL/dx = H z for dL/dg = z, as H is symmetric."""
+    """The residual g (B, N, 3) of a linearised step at x (B, N, 3).
+
+    DL/dx = H z for dL/dg = z, as H is symmetric.
+    """
 
     @override
     @staticmethod
@@ -188,7 +224,8 @@ class _Residual(AdjointFunction):
 
 
 def first_order(x: torch.Tensor, here: Linearisation, there: Linearisation) -> torch.Tensor:
-    """Returns solutions (E R, N, 3) of E other steps or equilibria each, to first order in what these differ by [m].
+    """Returns solutions (E R, N, 3) of E other steps or equilibria each,
+    to first order in what these differ by [m].
 
     Args:
         x: (R, N, 3) solution of the first ones [m].

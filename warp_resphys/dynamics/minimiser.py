@@ -1,4 +1,6 @@
-"""State of a minimisation on its device, and the kernel launches that advance it (``kernels.minimisation``)."""
+"""State of a minimisation on its device, and the kernel launches that advance it
+(``kernels.minimisation``).
+"""
 
 from typing import Any, NamedTuple
 
@@ -28,7 +30,8 @@ class Summary(NamedTuple):
 
 
 class _Iterates:
-    """Structs of the kernels on the memory of tensors: the current iterate of every environment, and its past.
+    """Structs of the kernels on the memory of tensors:
+    the current iterate of every environment, and its past.
 
     Args:
         potential: potential to minimise.
@@ -43,12 +46,21 @@ class _Iterates:
 
     def __init__(self, potential: IncrementalPotential, dtype: torch.dtype, memory: int) -> None:
         p, n = potential, potential.n_vertices
-        kinds = {name: wp.dtype_to_torch(v.type.dtype) for name, v in kernels.SolverProgress.vars.items()}
-        self.fields = {name: torch.zeros(p.batch, device=p.device, dtype=kind) for name, kind in kinds.items()}
+        kinds = {
+            name: wp.dtype_to_torch(v.type.dtype) for name, v in kernels.SolverProgress.vars.items()
+        }
+        self.fields = {
+            name: torch.zeros(p.batch, device=p.device, dtype=kind) for name, kind in kinds.items()
+        }
         self.progress = struct_of(kernels.SolverProgress, **self.fields)
         fields = {name: p.zeros(n, 3) for name in ("origin", "direction", "gradient")}
         self.search = struct_of(kernels.LineSearch, positions=p.positions, **fields)
-        sums = {"energy": p.energy, "size": p.energy_size, "balance": p.balance, "norm": p.residual_norm}
+        sums = {
+            "energy": p.energy,
+            "size": p.energy_size,
+            "balance": p.balance,
+            "norm": p.residual_norm,
+        }
         self.evaluation = struct_of(kernels.Evaluation, **sums, residual=p.residual)
 
         counts = torch.zeros(5, p.batch, device=p.device, dtype=torch.int32).unbind()
@@ -74,8 +86,9 @@ class Minimiser:
         hessian: matrix of the global step.
         dtype: dtype of L-BFGS pairs and right-hand sides.
         memory: number of L-BFGS pairs; 0 for Newton's method.
-        tolerances: a ``kernels.minimisation.Tolerances``. After `refactor_after` directions the next solve starts with
-            a new factor, and three times as many force a new factor within a solve; 0: always.
+        tolerances: a ``kernels.minimisation.Tolerances``. After `refactor_after` directions the
+            next solve starts with a new factor, and three times as many force a new factor within a
+            solve; 0: always.
     """
 
     def __init__(
@@ -92,7 +105,10 @@ class Minimiser:
         self._right = torch.zeros(p.batch, len(hessian.vertex_at), 3, device=p.device, dtype=dtype)
         summary = torch.zeros(len(Summary._fields), device=p.device, dtype=torch.int32)
         # A copy on the host; on a CPU the same memory.
-        self._summary, self._seen = summary, summary if p.device.type == "cpu" else summary.cpu().pin_memory()
+        self._summary, self._seen = (
+            summary,
+            summary if p.device.type == "cpu" else summary.cpu().pin_memory(),
+        )
         self._shown = self._seen.numpy()
         self._now = _Iterates(p, dtype, max(memory, 1))
         self._masks = [warp_view(mask, wp.int32) for mask in (p.tangent_active, p.clamp)]
@@ -101,16 +117,24 @@ class Minimiser:
         self._loop = self._record_loop() if self._runs_on_device else None
 
     def _record_directions(self) -> None:
-        """Records the start of a solve, the choice of environments to factorise, and new directions."""
+        """Records the start of a solve, the choice of environments
+        to factorise, and new directions.
+        """
         p, now, b = self._potential, self._now, self._potential.batch
         lbfgs = lbfgs_kernels(_scalar(self._right.dtype))
         right = warp_view(self._right, wp.vec3d if self._right.dtype == torch.float64 else wp.vec3f)
         vertex_at = p.upload(self.hessian.vertex_at.astype(np.int32), int)
-        inputs = [self._tolerances, warp_view(p.terms.force, wp.vec3d), warp_view(p.stiffness, wp.float64)]
+        inputs = [
+            self._tolerances,
+            warp_view(p.terms.force, wp.vec3d),
+            warp_view(p.stiffness, wp.float64),
+        ]
         begin = p.record_blocks(kernels.begin, b, inputs, [now.progress, now.search, now.history])
         outputs = [now.progress, now.pairs.count, *self._masks]
         self._select = p.record(kernels.select_for_factorisation, (b,), [], outputs)
-        self._project = p.record_blocks(lbfgs.project, b, [vertex_at, now.progress, now.search], [now.pairs, right])
+        self._project = p.record_blocks(
+            lbfgs.project, b, [vertex_at, now.progress, now.search], [now.pairs, right]
+        )
         outputs = [now.progress, now.search, now.pairs]
         set_direction = p.record_blocks(lbfgs.set_direction, b, [vertex_at, right], outputs)
         shorten_start, shorten_step = self._record_bounds()
@@ -124,7 +148,9 @@ class Minimiser:
         share = warp_view(p.zeros(), wp.float64)
         allow = p.record(kernels.allow_all, (p.batch,), [], [share])
         feasible, free = warp_view(p.feasible, wp.vec3d), warp_view(p.free_mask, wp.float64)
-        start = p.record(kernels.shorten_start, (p.batch, p.n_vertices), [share, free, feasible], [now.search])
+        start = p.record(
+            kernels.shorten_start, (p.batch, p.n_vertices), [share, free, feasible], [now.search]
+        )
         step = p.record_blocks(kernels.shorten_step, p.batch, [share], [now.progress, now.search])
         return (
             [allow, *p.bounds(feasible, now.search.positions, share), start],
@@ -132,12 +158,16 @@ class Minimiser:
         )
 
     def _record_evaluation(self, stores_pairs: int) -> None:
-        """Records the evaluation and the test of a trial, and the check whether a residual is rounding error."""
+        """Records the evaluation and the test of a trial,
+        and the check whether a residual is rounding error.
+        """
         p, now, b, n = self._potential, self._now, self._potential.batch, self._potential.n_vertices
         inputs = [stores_pairs, self._tolerances, warp_view(p.inertia, wp.float64), now.evaluation]
         inputs.append(warp_view(self.hessian.clamped, wp.bool))
         outputs = [now.progress, now.search, now.pairs, now.history]
-        accept = p.record_blocks(line_search.accept_kernel(_scalar(self._right.dtype)), b, inputs, outputs)
+        accept = p.record_blocks(
+            line_search.accept_kernel(_scalar(self._right.dtype)), b, inputs, outputs
+        )
         seen = [warp_view(self._summary, wp.int32), warp_view(p.active, wp.int32)]
         summarise = p.record_blocks(kernels.summarise, 1, [now.progress], seen)
         self._evaluation = [*p.evaluation, accept, summarise]
@@ -149,30 +179,53 @@ class Minimiser:
         inputs = [now.progress, p.upload(signs, wp.vec3d)]
         perturb = p.record_blocks(line_search.perturb, b, inputs, [now.search.positions, kept])
         outputs = [now.progress, now.search, now.history]
-        check = p.record_blocks(line_search.check_rounding, b, [kept, now.evaluation.residual], outputs)
+        check = p.record_blocks(
+            line_search.check_rounding, b, [kept, now.evaluation.residual], outputs
+        )
         self._check_rounding = p.capture(perturb, *p.evaluation, check, summarise)
 
     @property
     def _runs_on_device(self) -> bool:
-        """Whether a solve can be one graph of launches, with a loop and the factorisations (CUDA 12.4 and later)."""
+        """Whether a solve can be one graph of launches,
+        with a loop and the factorisations (CUDA 12.4 and later).
+        """
         h, p = self.hessian, self._potential
         loops = p.device.type == "cpu" or bool(wp.is_conditional_graph_supported())
-        return isinstance(h, ExactHessian) and isinstance(h.linear, TiledSolver) and not p.couples_cells and loops
+        return (
+            isinstance(h, ExactHessian)
+            and isinstance(h.linear, TiledSolver)
+            and not p.couples_cells
+            and loops
+        )
 
     def _record_loop(self) -> CapturedGraph:
         """Returns a whole solve as one graph."""
         p, h = self._potential, self.hessian
         assert isinstance(h, ExactHessian)
         assert isinstance(h.linear, TiledSolver)
-        # The factorisation works on the environments in `tangent_active`, and leaves only those set whose factor is not
-        # finite, to be factorised again with clamping; with that it is not finite where it fails.
+        # The factorisation works on the environments in `tangent_active`, and leaves only those set
+        # whose factor is not finite, to be factorised again with clamping; with that it is not
+        # finite where it fails.
         again = warp_view(torch.zeros(1, dtype=torch.int32, device=p.device), wp.int32)
-        mark = p.record(kernels.mark_clamped, (p.batch,), self._masks, [warp_view(h.clamped, wp.bool)])
+        mark = p.record(
+            kernels.mark_clamped, (p.batch,), self._masks, [warp_view(h.clamped, wp.bool)]
+        )
         solver = h.linear.record_factor(h.assembly.values, p.tangent_active, h.clamped)
-        factors = [mark, p.tangent_launches, solver.clear, h.assembly.launches, solver.factor, solver.check]
-        repeat = p.record_blocks(kernels.request_clamped, 1, self._masks[:1], [self._masks[1], again])
+        factors = [
+            mark,
+            p.tangent_launches,
+            solver.clear,
+            h.assembly.launches,
+            solver.factor,
+            solver.check,
+        ]
+        repeat = p.record_blocks(
+            kernels.request_clamped, 1, self._masks[:1], [self._masks[1], again]
+        )
         solve_factor = h.linear.record_solve(h.assembly.values, self._right.flatten(1))
-        conditions = (warp_view(self._summary[k : k + 1], wp.int32) for k in range(len(Summary._fields)))
+        conditions = (
+            warp_view(self._summary[k : k + 1], wp.int32) for k in range(len(Summary._fields))
+        )
         active, directions, requests, checks = conditions
 
         def factorise() -> None:
@@ -193,25 +246,35 @@ class Minimiser:
             wp.capture_while(active, advance)
 
         commands = [self._begin, self._select, self._project, *self._trials]
-        return p.capture_calls(solve, [*commands, self._check_rounding, *factors, repeat, solve_factor])
+        return p.capture_calls(
+            solve, [*commands, self._check_rounding, *factors, repeat, solve_factor]
+        )
 
     def solve(self, start: torch.Tensor, follows: torch.Tensor | None = None) -> SolveReport:
-        """Minimises the potential, whose ``positions`` are then the solution; with tiled factors without host on a GPU.
+        """Minimises the potential, whose ``positions`` are then the solution.
+
+        With tiled factors without host on a GPU.
 
         Args:
             start: (B, N, 3) where inertia alone would lead, or any initial guess [m].
-            follows: (B,) environments in which this step follows the last solved one: their starting point is
-                extrapolated, and factor and pairs are kept. None: no environment. Results of the others do not depend
-                on earlier solves. The constant factor of projective dynamics is always kept, its pairs are not.
+            follows: (B,) environments in which this step follows the last solved one: their
+                starting point is extrapolated, and factor and pairs are kept. None: no environment.
+                Results of the others do not depend on earlier solves. The constant factor of
+                projective dynamics is always kept, its pairs are not.
         """
         p, now = self._potential, self._now
-        kept = [now.corrections, now.pair_count, *([now.fields["factored"]] if self._refactors else [])]
+        kept = [
+            now.corrections,
+            now.pair_count,
+            *([now.fields["factored"]] if self._refactors else []),
+        ]
         for counts in kept:
             if follows is None:
                 counts.zero_()
             else:
                 counts.mul_(follows)
-        if not self._refactors:  # The last pairs of a long solve are of little use for the next one.
+        if not self._refactors:
+            # The last pairs of a long solve are of little use for the next one.
             now.pair_count.zero_()
         try:
             if self._loop is None:
@@ -223,7 +286,9 @@ class Minimiser:
             p.active.fill_(1)
         fields = now.fields
         iterations, factorisations = fields["iterations"].long(), fields["factorisations"].long()
-        return SolveReport(iterations, fields["relative"].clone(), fields["phase"] == kernels.DONE, factorisations)
+        return SolveReport(
+            iterations, fields["relative"].clone(), fields["phase"] == kernels.DONE, factorisations
+        )
 
     def _solve_from_host(self, start: torch.Tensor) -> None:
         if not self.hessian.ready():
@@ -246,11 +311,15 @@ class Minimiser:
         return self._check_and_read()
 
     def advance(self, state: Summary) -> Summary:
-        """Evaluates the next trial of every active environment, along a new direction where one is needed."""
+        """Evaluates the next trial of every active environment,
+        along a new direction where one is needed.
+        """
         p = self._potential
         if state.directions:
             p.launch(self._project)
-            self.hessian.solve_in_place(self._right, self._now.fields["phase"] == kernels.NEED_DIRECTION)
+            self.hessian.solve_in_place(
+                self._right, self._now.fields["phase"] == kernels.NEED_DIRECTION
+            )
             p.launch(self._first_trial)
         else:
             p.launch(self._next_trial)

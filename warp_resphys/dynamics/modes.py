@@ -21,11 +21,13 @@ _ZERO = 1e-12  # absolute difference for zero eigenvalues, in units of the large
 
 
 def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
-    """Returns orthonormal columns (3 N, count) that span the inertial forces M phi of the lowest vibration modes.
+    """Returns orthonormal columns (3 N, count) that span the inertial forces M phi
+    of the lowest vibration modes.
 
-    The modes phi solve K phi = omega^2 M phi with the stiffness K of the rest shape. They do not depend on rounding:
-    modes of equal frequency, such as the bending modes of a square beam, get a unique basis from
-    `align_degenerate_modes`; if the count cuts a cluster, its first modes are used.
+    The modes phi solve K phi = omega^2 M phi with the stiffness K of the rest shape. They do not
+    depend on rounding: modes of equal frequency, such as the bending modes of a square beam, get a
+    unique basis from `align_degenerate_modes`; if the count cuts a cluster, its first modes are
+    used.
 
     Raises:
         InputError: `count` is not between one and the number of free coordinates.
@@ -33,7 +35,9 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
     stiffness, inertia, free = _about_rest(simulator)
     unknowns = inertia.shape[0]
     if not 1 <= count <= unknowns:
-        raise InputError(f"{count} vibration modes were asked for, but the body has 1 to {unknowns}.")
+        raise InputError(
+            f"{count} vibration modes were asked for, but the body has 1 to {unknowns}."
+        )
     root = _root(inertia)
     unscale = _inverse(root)
     scaled = (unscale.T @ stiffness @ unscale).tocsc()
@@ -41,13 +45,17 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
     if unknowns <= max(_DENSE, number):
         values, shapes = scipy.linalg.eigh(scaled.toarray(), subset_by_index=[0, number - 1])
     else:
-        # Lanczos with a shift slightly below zero, where a free body is regular too, and a fixed starting vector.
+        # Lanczos with a shift slightly below zero, where a free body is regular too, and a fixed
+        # starting vector.
         below = -1e-8 * float(scaled.diagonal().max())
-        values, shapes = scipy.sparse.linalg.eigsh(scaled, number, sigma=below, v0=np.ones(unknowns))
+        values, shapes = scipy.sparse.linalg.eigsh(
+            scaled, number, sigma=below, v0=np.ones(unknowns)
+        )
         order = np.argsort(values)
         values, shapes = values[order], shapes[:, order]
     same = _SAME * np.abs(values) + _ZERO * scaled.diagonal().max()
-    shapes = align_degenerate_modes(values, shapes, simulator.body.mesh.vertices[free], same)[:, :count]
+    shapes = align_degenerate_modes(values, shapes, simulator.body.mesh.vertices[free], same)
+    shapes = shapes[:, :count]
     orthonormal = fix_signs(np.linalg.qr(root.T @ shapes)[0])
     basis = simulator.rest_positions.new_zeros(simulator.body.n_vertices, 3, count)
     basis[free] = simulator.tensor(orthonormal.reshape(-1, 3, count))
@@ -57,11 +65,12 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
 def align_degenerate_modes(
     values: FloatArray, shapes: FloatArray, positions: FloatArray, same: FloatArray | float
 ) -> FloatArray:
-    """Returns orthonormal shapes (3 F, m) with a unique basis, along the axes, for each set of equal eigenvalues.
+    """Returns orthonormal shapes (3 F, m) with a unique basis,
+    along the axes, for each set of equal eigenvalues.
 
-    An eigensolver returns an arbitrary basis of such a set, which depends on rounding. This basis diagonalises a
-    weighted sum of squares. The weights differ by axis, to separate bending in two directions, and grow along the axes,
-    to separate shapes with equal components.
+    An eigensolver returns an arbitrary basis of such a set, which depends on rounding. This basis
+    diagonalises a weighted sum of squares. The weights differ by axis, to separate bending in two
+    directions, and grow along the axes, to separate shapes with equal components.
 
     Args:
         values: (m,) eigenvalues, in order.
@@ -77,18 +86,21 @@ def align_degenerate_modes(
 
 
 def fix_signs(shapes: FloatArray) -> FloatArray:
-    """Returns columns (n, m) with signs such that the first entry of nearly maximal size is positive."""
+    """Returns columns (n, m) with signs such that the first entry
+    of nearly maximal size is positive.
+    """
     size = np.abs(shapes)
     first = (size > 0.99 * size.max(0)).argmax(0)
     return shapes * np.sign(np.take_along_axis(shapes, first[None], 0))
 
 
 def _root(inertia: scipy.sparse.csc_array) -> scipy.sparse.csc_array:
-    """Returns the triangular R with R^T R = M; only the few coordinates of rigid parts and glue are coupled."""
-    coupled, root = (
-        np.flatnonzero(np.diff(inertia.indptr) > 1),
-        scipy.sparse.diags_array(np.sqrt(inertia.diagonal())).tolil(),
-    )
+    """Returns the triangular R with R^T R = M.
+
+    Only the few coordinates of rigid parts and glue are coupled.
+    """
+    coupled = np.flatnonzero(np.diff(inertia.indptr) > 1)
+    root = scipy.sparse.diags_array(np.sqrt(inertia.diagonal())).tolil()
     if len(coupled):
         block = inertia[coupled][:, coupled].toarray()
         root[np.ix_(coupled, coupled)] = np.linalg.cholesky(block).T
@@ -104,11 +116,16 @@ def _inverse(root: scipy.sparse.csc_array) -> scipy.sparse.csc_array:
     return scipy.sparse.csc_array(inverse)
 
 
-def _about_rest(simulator: Simulator) -> tuple[scipy.sparse.csc_array, scipy.sparse.csc_array, IntArray]:
+def _about_rest(
+    simulator: Simulator,
+) -> tuple[scipy.sparse.csc_array, scipy.sparse.csc_array, IntArray]:
     """Returns elastic stiffness and inertia (3 F, 3 F) [N/m] at rest, and the F free vertices."""
-    simulator = replace(simulator, dtype=torch.float64)  # The lowest eigenvalues are below the rounding of float32.
+    # The lowest eigenvalues are below the rounding of float32.
+    simulator = replace(simulator, dtype=torch.float64)
     rest = simulator.rest_state()
-    elastic = simulator.prepare({name: 0.0 for name in simulator.parameters if name.endswith(VISCOUS)})
+    elastic = simulator.prepare(
+        {name: 0.0 for name in simulator.parameters if name.endswith(VISCOUS)}
+    )
     linearisation = simulator.linearise(rest, parameters=elastic)
     hessian, _ = linearisation.matrix(rest.q)
     inertia = linearisation.inertia_matrix(rest.q)
@@ -127,13 +144,16 @@ class RestStiffness:
 
     def __init__(self, simulator: Simulator) -> None:
         if not simulator.is_held(simulator.rest_state()):
-            raise InputError("a body without fixed vertices follows any force without end: fix some vertices.")
+            raise InputError(
+                "a body without fixed vertices follows any force without end: fix some vertices."
+            )
         stiffness, _, free = _about_rest(simulator)
         self._matrix = stiffness
         self._factor = scipy.sparse.linalg.splu(stiffness)
         self._dofs = (3 * free[:, None] + np.arange(3)).ravel()
         coordinates, n = simulator.body.coordinates, simulator.body.n_vertices
-        self._map = scipy.sparse.csr_array(scipy.sparse.kron(coordinates.matrix, np.eye(3)))  # (3 N, 3 N)
+        # (3 N, 3 N)
+        self._map = scipy.sparse.csr_array(scipy.sparse.kron(coordinates.matrix, np.eye(3)))
         self._size = 3 * n
 
     def displacements(self, forces: FloatArray) -> FloatArray:

@@ -1,23 +1,28 @@
-"""Nonlinear solvers for the incremental potential: local steps on the points, global steps with a factorised matrix.
+"""Nonlinear solvers for the incremental potential: local steps on the points,
+global steps with a factorised matrix.
 
 The three solvers differ only in the matrix of the global step:
 
-=======================  ====================================================================================
-``projective_dynamics``  constant projective-dynamics matrix, accelerated by L-BFGS (Liu et al. 2017)
-``quasi_newton``         Hessian of a recent state, accelerated by L-BFGS; refactorised when convergence is slow
-``newton``               Hessian of every iterate, clamped to positive eigenvalues where it is not positive definite
-=======================  ====================================================================================
+=======================  =======================================================================
+``projective_dynamics``  constant projective-dynamics matrix, accelerated by L-BFGS (Liu et al.
+                         2017)
+``quasi_newton``         Hessian of a recent state, accelerated by L-BFGS; refactorised when
+                         convergence is slow
+``newton``               Hessian of every iterate, clamped to positive eigenvalues where it is
+                         not positive definite
+=======================  =======================================================================
 
-An environment has converged when its residual is at most ``relative_tolerance`` times the norm of the balancing forces,
-inertia and loads. Because of rounding, an environment whose residual has not halved in three iterations has also
-converged if the residual is less than its measured change when every coordinate moves by one rounding unit; and an
-environment without loads, if its first step is within the rounding of its state.
+An environment has converged when its residual is at most ``relative_tolerance`` times the norm of
+the balancing forces, inertia and loads. Because of rounding, an environment whose residual has not
+halved in three iterations has also converged if the residual is less than its measured change when
+every coordinate moves by one rounding unit; and an environment without loads, if its first step is
+within the rounding of its state.
 
-Residuals and positions are float64. Factors and L-BFGS pairs may be float32, which affects only the number of
-iterations.
+Residuals and positions are float64. Factors and L-BFGS pairs may be float32, which affects only the
+number of iterations.
 
-Kernels make all decisions for an environment (`minimiser`); the host launches them and factorises, or launches a graph
-that does both.
+Kernels make all decisions for an environment (`minimiser`); the host launches them and factorises,
+or launches a graph that does both.
 """
 
 from typing import get_args
@@ -41,8 +46,12 @@ _REFACTOR_AFTER = 4  # iterations of a step above which ``quasi_newton`` refacto
 _PATIENCE = 3  # by which it is multiplied where factors are kept
 
 
-def check_converged(settings: SolverSettings, report: SolveReport | None, positions: torch.Tensor) -> None:
-    """Raises ConvergenceError with the last positions (B, N, 3) if a solve failed and failures are not counted."""
+def check_converged(
+    settings: SolverSettings, report: SolveReport | None, positions: torch.Tensor
+) -> None:
+    """Raises ConvergenceError with the last positions (B, N, 3)
+    if a solve failed and failures are not counted.
+    """
     if settings.on_failure != "raise" or report is None or bool(report.converged.all()):
         return
     worst = int((~report.converged).nonzero()[0])
@@ -50,16 +59,18 @@ def check_converged(settings: SolverSettings, report: SolveReport | None, positi
     if settings.name != "newton":
         other = "raise solver.max_iterations, or choose solver.name=newton."
     raise ConvergenceError(
-        f"the {settings.name} solver stopped after {int(report.iterations[worst])} iterations with a relative residual "
-        f"of {float(report.relative_residual[worst]):.2e} in environment {worst} of {len(report.converged)}: take a "
-        f"smaller time step or loads, {other}",
+        f"the {settings.name} solver stopped after {int(report.iterations[worst])} iterations "
+        f"with a relative residual of {float(report.relative_residual[worst]):.2e} in "
+        f"environment {worst} of {len(report.converged)}: "
+        f"take a smaller time step or loads, {other}",
         positions.detach(),
         report,
     )
 
 
 class ConvergenceCheck:
-    """Checks the states of a roll-out, on a GPU those of many steps at once: the host waits for it only then.
+    """Checks the states of a roll-out, on a GPU those of many steps at once:
+    the host waits for it only then.
 
     Args:
         settings: settings of the solver.
@@ -83,7 +94,10 @@ class ConvergenceCheck:
 
 
 def make_minimiser(
-    potential: IncrementalPotential, pattern: BlockPattern, settings: SolverSettings, dtype: torch.dtype
+    potential: IncrementalPotential,
+    pattern: BlockPattern,
+    settings: SolverSettings,
+    dtype: torch.dtype,
 ) -> Minimiser:
     """Returns the minimiser of a potential.
 

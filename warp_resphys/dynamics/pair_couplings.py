@@ -45,21 +45,26 @@ class PairCouplings:
             self._reduction = VertexCouplings(torch.cat([itself, place]), shares)
 
     def __call__(self, parts: Sequence[PairTangents]) -> list[Coupling]:
-        """Returns second derivatives of pairs as matrices of the unknowns, one for every environment with pairs."""
+        """Returns second derivatives of pairs as matrices of the unknowns,
+        one for every environment with pairs.
+        """
         if not parts:
             return []
         environment = torch.cat([part.environment for part in parts])
         nodes = self._place[torch.cat([part.nodes for part in parts])]
         blocks = torch.cat([part.blocks for part in parts])
         device, total = nodes.device, len(self._vertices)
-        keys, local = torch.where(nodes < 0, -1, environment[:, None] * total + nodes).unique(return_inverse=True)
+        keys, local = torch.where(nodes < 0, -1, environment[:, None] * total + nodes).unique(
+            return_inverse=True
+        )
         fixed = int((keys < 0).sum())  # all fixed vertices have one key
         keys, local = keys[fixed:], local - fixed
         if not len(keys):
             return []
         row = keys // total
         count, at = numbered(row, self._potential.batch)
-        # A size that depends on the environment alone, so that on a CPU it is bit for bit what it is in another batch.
+        # A size that depends on the environment alone, so that on a CPU it is bit for bit what it
+        # is in another batch.
         sizes = -(-count // _ROUNDED) * _ROUNDED
         order = sizes.argsort(stable=True)
         squares = (3 * sizes[order]) ** 2
@@ -71,19 +76,30 @@ class PairCouplings:
         vertices = torch.full((len(sizes), int(sizes.max())), -1, device=device)
         vertices[row, at] = keys % total
         out, done = list[Coupling](), 0
-        for size, number in zip(*(x.tolist() for x in sizes.unique(return_counts=True)), strict=True):
+        for size, number in zip(
+            *(x.tolist() for x in sizes.unique(return_counts=True)), strict=True
+        ):
             environments, m = order[sizes[order] == size], 3 * size
             if size:
                 matrices = values[done : done + number * m * m].view(number, m, m)
                 if self._reduction is None:
-                    out.append(Coupling(environments, coordinates(vertices[environments, :size]), matrices))
+                    out.append(
+                        Coupling(environments, coordinates(vertices[environments, :size]), matrices)
+                    )
                 else:
-                    out += self._reduction.reduced(environments, vertices[environments, :size], matrices)
+                    out += self._reduction.reduced(
+                        environments, vertices[environments, :size], matrices
+                    )
                 done += number * m * m
         return out
 
     def _summed(
-        self, blocks: torch.Tensor, local: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor, size: int
+        self,
+        blocks: torch.Tensor,
+        local: torch.Tensor,
+        rows: torch.Tensor,
+        columns: torch.Tensor,
+        size: int,
     ) -> torch.Tensor:
         """Returns the values of the matrices (``kernels.hessian_blocks.sum_blocks``).
 
@@ -99,14 +115,18 @@ class PairCouplings:
         """
         if size > _MOST_VALUES:
             raise InputError(
-                f"the matrices of contact have {size:.1e} numbers, beyond the {_MOST_VALUES:.1e} that a kernel "
-                "addresses: take fewer environments, or coarser surfaces."
+                f"the matrices of contact have {size:.1e} numbers, beyond the {_MOST_VALUES:.1e} "
+                "that a kernel addresses: take fewer environments, or coarser surfaces."
             )
         launcher, values = self._potential, blocks.new_zeros(size)
         entry = local.ravel().argsort(stable=True)
-        start = torch.searchsorted(local.ravel()[entry], torch.arange(len(rows) + 1, device=local.device))
+        start = torch.searchsorted(
+            local.ravel()[entry], torch.arange(len(rows) + 1, device=local.device)
+        )
         arrays = [(start, wp.int32), (entry, wp.int32), (rows, wp.vec3i), (columns, wp.vec4i)]
         inputs = [warp_view(array.to(torch.int32), kind) for array, kind in arrays]
         inputs.append(warp_view(blocks, wp.float64))
-        launcher.launch(launcher.record(sum_blocks, (len(rows),), inputs, [warp_view(values, wp.float64)]))
+        launcher.launch(
+            launcher.record(sum_blocks, (len(rows),), inputs, [warp_view(values, wp.float64)])
+        )
         return values

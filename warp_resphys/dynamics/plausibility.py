@@ -1,4 +1,6 @@
-"""Values that look like a mistake, as units, nearly flat cells and slow sizes: warnings, and errors."""
+"""Values that look like a mistake, as units, nearly flat cells
+and slow sizes: warnings, and errors.
+"""
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -20,8 +22,10 @@ from ..mesh.volume_mesh import Mesh
 from ..settings.contact import HalfSpace
 
 SOFTEST: Final = 1e3  # Pa, of gels
-UNLIKELY: Final = (1e8, 1e9)  # Pa, stiffer than rubbers and softer than the plastics that hard parts are made of
-# kg/m^3, of g/cm^3, kg/mm^3 and t/mm^3 that were taken for it, and heavier than metals; 0.001 makes a body massless
+# Pa, stiffer than rubbers and softer than the plastics that hard parts are made of
+UNLIKELY: Final = (1e8, 1e9)
+# kg/m^3, of g/cm^3, kg/mm^3 and t/mm^3 that were taken for it, and heavier than metals; 0.001 makes
+# a body massless
 DENSITIES: Final = ((0.5, 10.0), (1e-10, 1e-5), (2.5e4, np.inf))
 STRONGEST: Final = 100.0  # m/s^2
 FLAT_CELL: Final = 0.02  # scaled Jacobian
@@ -49,12 +53,15 @@ def warn_of_implausible(
         _warn_of_material(material, f" of {name}" if name else "")
     size = float(np.linalg.norm(gravity))
     if size > STRONGEST:
-        warn(f"gravity is {size:g} m/s^2: give it in m/s^2, not in mm/s^2 or in g, as in (0, 0, -9.81).")
+        warn(
+            f"gravity is {size:g} m/s^2: give it in m/s^2, "
+            "not in mm/s^2 or in g, as in (0, 0, -9.81)."
+        )
     unknowns = 3 * (body.n_vertices - len(body.fixed_vertices))
     if on_cpu and unknowns > MANY_UNKNOWNS:
         warn(
-            f"the simulator has {unknowns:,} unknowns, and a step of it takes seconds on a CPU: take larger cells for "
-            "a first look, or device='cuda'."
+            f"the simulator has {unknowns:,} unknowns, and a step of it takes seconds on a CPU: "
+            "take larger cells for a first look, or device='cuda'."
         )
 
 
@@ -62,23 +69,25 @@ def _warn_of_mesh(mesh: Mesh, name: str) -> None:
     across = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     if not SHORTEST_DIAGONAL <= across <= LONGEST_DIAGONAL:
         warn(
-            f"{name} is {across:g} m across: lengths are in m, so check the unit of its mesh (units in Python, "
-            "mesh.units in a configuration)."
+            f"{name} is {across:g} m across: lengths are in m, so check the unit of its mesh "
+            "(units in Python, mesh.units in a configuration)."
         )
     worst, value = _worst_cell(mesh)
     if value < FLAT_CELL:
         x, y, z = 1e3 * mesh.vertices[mesh.cells[worst]].mean(axis=0)
         warn(
-            f"cell {worst} of {name} around ({x:.4g}, {y:.4g}, {z:.4g}) mm is nearly flat (its scaled Jacobian is "
-            f"{value:.2g}; 1 is ideal, 0 is flat): steps may be slow or fail there, so mesh the body anew."
+            f"cell {worst} of {name} around ({x:.4g}, {y:.4g}, {z:.4g}) mm is nearly flat (its "
+            f"scaled Jacobian is {value:.2g}; 1 is ideal, 0 is flat): steps may be slow or fail "
+            "there, so mesh the body anew."
         )
 
 
 def _warn_of_inertia(body: Body, name: str) -> None:
-    """Warns of a body that turns freely and whose mass, which lies on the vertices, has a wrong rotary inertia.
+    """Warns of a body that turns freely and whose mass,
+    which lies on the vertices, has a wrong rotary inertia.
 
-    By uniform density: 1 + 2 / n^2 times that of a cube of n linear cells along an edge. Rigid parts are exact, and a
-    body that lies on a floor does not turn over.
+    By uniform density: 1 + 2 / n^2 times that of a cube of n linear cells along an edge. Rigid
+    parts are exact, and a body that lies on a floor does not turn over.
     """
     soft = np.arange(len(body.mesh.cells)) if body.soft_cells is None else body.soft_cells
     if len(body.fixed_vertices) or body.symmetry or not len(soft) or _lies_on_floor(body):
@@ -86,15 +95,19 @@ def _warn_of_inertia(body: Body, name: str) -> None:
     places, volumes = volume_points(body.mesh, np.arange(len(body.mesh.cells)))
     centre = volumes @ places / volumes.sum()
     exact = _inertia(places - centre, volumes)
-    lumped = _inertia(body.vertices - centre, np.asarray(body.mass_volume[:, soft].sum(axis=1)).ravel())
+    lumped = _inertia(
+        body.vertices - centre, np.asarray(body.mass_volume[:, soft].sum(axis=1)).ravel()
+    )
     places, volumes = volume_points(body.mesh, soft)
-    ratios = 1.0 + scipy.linalg.eigh(lumped - _inertia(places - centre, volumes), exact, eigvals_only=True)
+    ratios = 1.0 + scipy.linalg.eigh(
+        lumped - _inertia(places - centre, volumes), exact, eigvals_only=True
+    )
     ratio = float(ratios[np.abs(ratios - 1.0).argmax()])
     if abs(ratio - 1.0) > INERTIA_ERROR:
         warn(
-            f"{name}, which nothing holds, has {ratio:.3g} times its true rotary inertia, because its mass lies on the "
-            "vertices of few cells: take more cells, quadratic hexahedra by quadratic(mesh), or a rigid body, "
-            "which is exact."
+            f"{name}, which nothing holds, has {ratio:.3g} times its true rotary inertia, "
+            "because its mass lies on the vertices of few cells: take more cells, quadratic "
+            "hexahedra by quadratic(mesh), or a rigid body, which is exact."
         )
 
 
@@ -102,9 +115,15 @@ def _lies_on_floor(body: Body) -> bool:
     """Whether an undeformed body is within the distance of contact of a half-space."""
     contacts = [energy for energy in body.energies if isinstance(energy, Contact)]
     floors = [
-        (contact, floor) for contact in contacts for floor in contact.obstacles.values() if isinstance(floor, HalfSpace)
+        (contact, floor)
+        for contact in contacts
+        for floor in contact.obstacles.values()
+        if isinstance(floor, HalfSpace)
     ]
-    return any(float(((body.vertices - f.position) @ f.turn[:, 2]).min()) < contact.distance for contact, f in floors)
+    return any(
+        float(((body.vertices - f.position) @ f.turn[:, 2]).min()) < contact.distance
+        for contact, f in floors
+    )
 
 
 def _inertia(arms: NDArray[np.float64], masses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -124,16 +143,23 @@ def _warn_of_material(material: Material, of: str) -> None:
     stiffness, density = small_strain_stiffness(material), mean_of(material.values["density"])
     if 0.0 < stiffness < SOFTEST or UNLIKELY[0] < stiffness < UNLIKELY[1]:
         kind = "softer than a gel" if stiffness < SOFTEST else "stiffer than any rubber"
-        warn(f"Young's modulus{of} is {stiffness:.3g} Pa, {kind}: give moduli in Pa, as in 3e5 for a soft silicone.")
+        warn(
+            f"Young's modulus{of} is {stiffness:.3g} Pa, {kind}: give moduli in Pa, as in 3e5 "
+            "for a soft silicone."
+        )
     if any(lower < density < upper for lower, upper in DENSITIES):
         kind = "heavier than any metal" if density > DENSITIES[-1][0] else "lighter than a foam"
-        warn(f"density{of} is {density:.3g} kg/m^3, {kind}: give it in kg/m^3, as in 1070 for silicone, not in g/cm^3.")
+        warn(
+            f"density{of} is {density:.3g} kg/m^3, {kind}: give it in kg/m^3, as in 1070 for "
+            "silicone, not in g/cm^3."
+        )
 
 
 def check_weight(body: Body, material: Material, gravity: Sequence[float]) -> None:
     """Refuses a body with very large strains under its own weight, which indicate a wrong unit.
 
-    A body of length L under its weight has strains of about rho g L / E: one percent for an arm of silicone.
+    A body of length L under its weight has strains of about rho g L / E: one percent for an arm of
+    silicone.
 
     Raises:
         InputError: the strain is too large, or the material resists no change of shape.
@@ -142,23 +168,32 @@ def check_weight(body: Body, material: Material, gravity: Sequence[float]) -> No
     parameters = material.values
     density, stiffness = mean_of(parameters["density"]), small_strain_stiffness(material)
     if stiffness <= 0.0:
-        raise InputError("the material resists no change of shape: give it a coefficient of shear, such as c10.")
+        raise InputError(
+            "the material resists no change of shape: give it a coefficient of shear, such as c10."
+        )
     strain = density * float(np.linalg.norm(gravity)) * length / stiffness
     if strain > _LARGEST_STRAIN:
         raise InputError(
-            f"the mesh is {length:.3g} m across: with E = {1e-3 * stiffness:.3g} kPa its own weight would strain it by "
-            f"{100.0 * strain:.0f} %; is its unit millimetres (mesh.units=mm), or that of {next(iter(parameters))} not "
-            "Pa?"
+            f"the mesh is {length:.3g} m across: with E = {1e-3 * stiffness:.3g} kPa its own "
+            f"weight would strain it by {100.0 * strain:.0f} %; is its unit millimetres "
+            f"(mesh.units=mm), or that of {next(iter(parameters))} not Pa?"
         )
 
 
 def small_strain_stiffness(material: Material) -> float:
-    """Mean Young's modulus of a material at small strains [Pa]; three shear moduli if that is no parameter."""
-    parameters = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in material.values.items()}
+    """Mean Young's modulus of a material at small strains [Pa].
+
+    Three shear moduli if that is no parameter.
+    """
+    parameters = {
+        name: torch.as_tensor(value, dtype=torch.float64) for name, value in material.values.items()
+    }
     if "youngs_modulus" in parameters:
         return mean_of(parameters["youngs_modulus"])
     terms = zip(material.moduli(parameters), material.curvature, material.rules, strict=True)
-    return 1.5 * sum(mean_of(modulus) * factor for modulus, factor, rule in terms if rule == "shape")
+    return 1.5 * sum(
+        mean_of(modulus) * factor for modulus, factor, rule in terms if rule == "shape"
+    )
 
 
 def mean_of(value: Any) -> float:

@@ -1,4 +1,6 @@
-"""Static equilibria, under gradually increasing loads where Newton's method does not converge under all of them."""
+"""Static equilibria, under gradually increasing loads
+where Newton's method does not converge under all of them.
+"""
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
@@ -34,7 +36,9 @@ Solve = Callable[[float, torch.Tensor], tuple[torch.Tensor, SolveReport]]
 
 
 class StaticEquilibrium(TimeStep):
-    """A static equilibrium under constant inputs after a state: a step without end, in which inertia has no part."""
+    """A static equilibrium under constant inputs after a state:
+    a step without end, in which inertia has no part.
+    """
 
     @override
     def _begin(self, state: State, inputs: Inputs, constants: Constants) -> SimulatorStep:
@@ -46,20 +50,25 @@ class StaticEquilibrium(TimeStep):
 
         Args:
             share: of the loads and the inputs.
-            near: (B, N, 3) positions of the forces that depend on the pose without a potential; None: without them [m].
+            near: (B, N, 3) positions of the forces that depend on the pose without a potential;
+                None: without them [m].
         """
         return self.equations.energies.rest_terms(self.step, share, near)
 
     @override
     def fixed_positions(self, share: float = 1.0) -> torch.Tensor:
-        """Returns the positions (B, D, 3) of the fixed vertices after a share of their motion from the rest shape."""
+        """Returns the positions (B, D, 3) of the fixed vertices
+        after a share of their motion from the rest shape.
+        """
         equations, moved = self.equations, self.step.inputs.fixed_positions
         clamp = equations.rest_positions[equations.fixed].expand(self.step.state.batch, -1, -1)
         return clamp if moved is None else torch.lerp(clamp, moved, share)
 
     @override
     def finish(self, x: torch.Tensor) -> State:
-        return State(x, torch.zeros_like(x), memory=self.equations.energies.end_step(self.step, x, x))
+        return State(
+            x, torch.zeros_like(x), memory=self.equations.energies.end_step(self.step, x, x)
+        )
 
     def _solved(self, x: torch.Tensor) -> State:
         """Returns the state of the last `_balance`, with its reaction."""
@@ -78,7 +87,8 @@ class StaticEquilibrium(TimeStep):
         """
         equations, state = self.equations, self.step.state
         limited = equations.settings.max_iterations < _MOST_ITERATIONS
-        rest, guess = equations.rest_positions.expand_as(state.q), (state.q if near is None else near).detach()
+        rest = equations.rest_positions.expand_as(state.q)
+        guess = (state.q if near is None else near).detach()
         if not self._follows_pose:
             return self._solved(find_equilibrium(self._balance, rest, guess, limited))
         try:
@@ -95,28 +105,38 @@ class StaticEquilibrium(TimeStep):
     def _balance(
         self, share: float, start: torch.Tensor, near: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, SolveReport]:
-        """Returns the equilibrium (B, N, 3) [m] under a share of loads, inputs and the motion of the fixed vertices."""
+        """Returns the equilibrium (B, N, 3) [m] under a share of loads,
+        inputs and the motion of the fixed vertices.
+        """
         equations, workspace = self.equations, self.workspace
         most = min(equations.settings.max_iterations, _MOST_ITERATIONS)
-        settings = equations.settings.changed(name="newton", on_failure="raise", max_iterations=most)
-        if equations.rest_positions.dtype == torch.float64:  # Newton's method gets there in about one iteration more.
+        settings = equations.settings.changed(
+            name="newton", on_failure="raise", max_iterations=most
+        )
+        if equations.rest_positions.dtype == torch.float64:
+            # Newton's method gets there in about one iteration more.
             settings = settings.changed(relative_tolerance=min(settings.relative_tolerance, _EXACT))
         terms, fixed = self.terms(share, near=near), self.fixed_positions(share)
         with _progress_of(workspace.parts[0][1].potential, share, most):
-            x, report, self._gradient = equilibrium(workspace, "statics", settings, terms, start, fixed)
+            x, report, self._gradient = equilibrium(
+                workspace, "statics", settings, terms, start, fixed
+            )
         check_converged(settings, report, x)
         return equations.coordinates.expand(x), report
 
 
 def friction_holds(contacts: Iterable[ContactForces]) -> bool:
-    """Returns whether friction with obstacles holds three vertices or more in every environment, after a `SHIFT`."""
+    """Returns whether friction with obstacles holds three vertices
+    or more in every environment, after a `SHIFT`.
+    """
     rubbing = [contact.friction != 0.0 for contact in contacts if contact.obstacles]
     return any(bool((vertices.any(-1).any(-1).sum(-1) >= _HELD_BY).all()) for vertices in rubbing)
 
 
 @contextmanager
 def _progress_of(potential: IncrementalPotential, share: float, most: int) -> Iterator[None]:
-    """Shows the iterations of a solve that takes longer than two seconds, with the residual over balancing forces.
+    """Shows the iterations of a solve that takes longer than two seconds,
+    with the residual over balancing forces.
 
     Args:
         potential: that is minimised.
@@ -125,7 +145,9 @@ def _progress_of(potential: IncrementalPotential, share: float, most: int) -> It
     """
     under = "" if share == 1.0 else f" under {share:.0%} of the loads"
     before = potential.on_direction
-    with Progress(f"static equilibrium{under}", most, "iterations at most", after=QUIET_SECONDS) as progress:
+    with Progress(
+        f"static equilibrium{under}", most, "iterations at most", after=QUIET_SECONDS
+    ) as progress:
 
         def advance() -> None:
             progress.advance(residual=float((potential.residual_norm / potential.balance).max()))
@@ -137,7 +159,9 @@ def _progress_of(potential: IncrementalPotential, share: float, most: int) -> It
             potential.on_direction = before
 
 
-def find_equilibrium(solve: Solve, rest: torch.Tensor, start: torch.Tensor, limited: bool) -> torch.Tensor:
+def find_equilibrium(
+    solve: Solve, rest: torch.Tensor, start: torch.Tensor, limited: bool
+) -> torch.Tensor:
     """Returns the equilibrium (B, N, 3) under all loads, differentiable [m].
 
     Args:
@@ -160,8 +184,9 @@ def find_equilibrium(solve: Solve, rest: torch.Tensor, start: torch.Tensor, limi
     grown = ~((x.detach() - rest).abs().flatten(1).amax(1) < _MOST_LENGTHS * length)
     if bool(grown.any()):
         raise ConvergenceError(
-            f"{int(grown.sum())} of {len(x)} bodies have no equilibrium under these loads: they grow to more than "
-            f"{_MOST_LENGTHS:g} times their size; lower the loads, or take a stiffer material.",
+            f"{int(grown.sum())} of {len(x)} bodies have no equilibrium under these loads: they "
+            f"grow to more than {_MOST_LENGTHS:g} times their size; lower the loads, or take a "
+            "stiffer material.",
             x.detach(),
             replace(report, converged=report.converged & ~grown),
         )
@@ -169,7 +194,9 @@ def find_equilibrium(solve: Solve, rest: torch.Tensor, start: torch.Tensor, limi
 
 
 def _ramp_loads(solve: Solve, rest: torch.Tensor, limit: ConvergenceError | None) -> torch.Tensor:
-    """Returns the equilibrium (B, N, 3) reached by increasing the loads from zero in steps, or raises ``limit``."""
+    """Returns the equilibrium (B, N, 3) reached by increasing the loads
+    from zero in steps, or raises ``limit``.
+    """
     done, step, x = 0.0, 0.5, rest
     while done < 1.0:
         share = min(done + step, 1.0)
@@ -181,8 +208,8 @@ def _ramp_loads(solve: Solve, rest: torch.Tensor, limit: ConvergenceError | None
                 raise limit from None
             if step < _LEAST_SHARE:
                 raise ConvergenceError(
-                    f"no equilibrium was found: under growing loads it is lost beyond {100.0 * done:.0f} % of them; "
-                    "lower the loads, or take a stiffer material.",
+                    "no equilibrium was found: under growing loads it is lost beyond "
+                    f"{100.0 * done:.0f} % of them; lower the loads, or take a stiffer material.",
                     x,
                     error.report,
                 ) from None

@@ -1,15 +1,18 @@
 """Roll-outs on a Warp tape, with the same gradients as ``torch.autograd``.
 
-A recorded roll-out can be combined with other kernels on a tape; ``tape.backward`` differentiates all of them::
+A recorded roll-out can be combined with other kernels on a tape; ``tape.backward`` differentiates
+all of them::
 
     with wp.Tape() as tape:
         wp.launch(forces, dim=..., inputs=[parameters], outputs=[forces])
-        path, speeds = record_rollout(tape, simulator, q, v, steps=60, inputs={"external_force": forces})
+        path, speeds = record_rollout(
+            tape, simulator, q, v, steps=60, inputs={"external_force": forces}
+        )
         wp.launch(loss, dim=..., inputs=[path], outputs=[value])
     tape.backward(value)
 
-Nothing is copied: torch uses the memory of the input arrays, and the result arrays use torch's memory. As with torch, a
-step keeps only its states and terms for the adjoint.
+Nothing is copied: torch uses the memory of the input arrays, and the result arrays use torch's
+memory. As with torch, a step keeps only its states and terms for the adjoint.
 """
 
 from collections.abc import Callable, Mapping
@@ -42,9 +45,9 @@ def record_rollout(
 ) -> tuple[wp.array, wp.array]:
     """Simulates several time steps and records their adjoint on a tape.
 
-    Gradients are added to the ``grad`` of every input array that requires gradients. As for Warp's kernels, the arrays
-    must keep their values until ``tape.backward``, which reads the gradients of the results and sets them to zero
-    unless they are retained. It may be called repeatedly.
+    Gradients are added to the ``grad`` of every input array that requires gradients. As for Warp's
+    kernels, the arrays must keep their values until ``tape.backward``, which reads the gradients of
+    the results and sets them to zero unless they are retained. It may be called repeatedly.
 
     Args:
         tape: a tape, active or not.
@@ -53,16 +56,17 @@ def record_rollout(
         v: (B, N) vec3 velocities [m/s].
         steps: number of steps T.
         previous: (q, v) one step earlier, to continue a roll-out by BDF2: its ``(q[-2], v[-2])``.
-        inputs: inputs by name: ``external_force`` and ``internal_force`` (B, N) vec3 [N], ``fixed_positions``
-            (B, D) vec3 [m], ``attached_mass`` (B, N) [kg], and those of the energies (B, n); all but the masses may
-            have a leading time axis T.
+        inputs: inputs by name: ``external_force`` and ``internal_force`` (B, N) vec3 [N],
+            ``fixed_positions`` (B, D) vec3 [m], ``attached_mass`` (B, N) [kg], and those of the
+            energies (B, n); all but the masses may have a leading time axis T.
         parameters: parameters by name, with shapes as in `Simulator.prepare`.
 
     Returns:
         Positions [m] and velocities [m/s] as (T + 1, B, N) vec3, including the start.
 
     Raises:
-        InputError: an unknown parameter, a wrong dtype, device or shape, or values that are not finite.
+        InputError: an unknown parameter, a wrong dtype, device or shape, or values that are not
+            finite.
         ConvergenceError: as in `Simulator.step`.
     """
     leaves = _Leaves(simulator)
@@ -80,7 +84,9 @@ def record_rollout(
     results = [motion.q, motion.v]
     arrays = [leaves.result(tensor) for tensor in results]
     if leaves.pairs:
-        tape.record_func(leaves.backward(results, arrays), [array for array, _ in leaves.pairs] + arrays)
+        tape.record_func(
+            leaves.backward(results, arrays), [array for array, _ in leaves.pairs] + arrays
+        )
     return arrays[0], arrays[1]
 
 
@@ -105,9 +111,14 @@ class _Leaves:
         return self._leaf(name, array, _SCALARS[self.dtype])
 
     def _leaf(self, name: str, array: wp.array, dtype: type) -> torch.Tensor:
-        if not isinstance(array, wp.array) or array.dtype != dtype or array.device != self._warp_device:
+        if (
+            not isinstance(array, wp.array)
+            or array.dtype != dtype
+            or array.device != self._warp_device
+        ):
             raise InputError(
-                f"{name} must be a Warp array of {dtype.__name__} on {self._warp_device}, like the simulator."
+                f"{name} must be a Warp array of {dtype.__name__} "
+                f"on {self._warp_device}, like the simulator."
             )
         leaf = wp.to_torch(array, requires_grad=False)
         if array.requires_grad:
@@ -117,11 +128,15 @@ class _Leaves:
 
     def result(self, tensor: torch.Tensor) -> wp.array:
         """Returns the array of vec3 on the memory of a result tensor."""
-        array = wp.from_torch(tensor.detach(), dtype=_VECTORS[self.dtype], requires_grad=bool(self.pairs))
+        array = wp.from_torch(
+            tensor.detach(), dtype=_VECTORS[self.dtype], requires_grad=bool(self.pairs)
+        )
         return cast(wp.array, array)
 
     def stream(self) -> AbstractContextManager[object]:
-        """Returns a context in which torch uses Warp's stream, so that their operations are ordered."""
+        """Returns a context in which torch uses Warp's stream,
+        so that their operations are ordered.
+        """
         if self.device.type == "cpu":
             return nullcontext()
         return torch.cuda.stream(wp.stream_to_torch(self._warp_device))
@@ -133,7 +148,9 @@ class _Leaves:
             with self.stream():
                 adjoints = [wp.to_torch(array.grad) for array in arrays]
                 leaves = [leaf for _, leaf in self.pairs]
-                gradients = torch.autograd.grad(results, leaves, adjoints, retain_graph=True, allow_unused=True)
+                gradients = torch.autograd.grad(
+                    results, leaves, adjoints, retain_graph=True, allow_unused=True
+                )
                 for (array, _), gradient in zip(self.pairs, gradients, strict=True):
                     if gradient is not None:
                         wp.to_torch(array.grad).add_(gradient)

@@ -16,7 +16,9 @@ from .equilibrium import equilibrium, reaction_of
 
 _MOST_SETTLINGS = 100
 _REMEDY = "the step does not settle: take a smaller time step or internal forces"
-_SETTLED = 1e-10  # change of the positions, or of the gradient, relative to their size; or some roundings
+_SETTLED = (
+    1e-10  # change of the positions, or of the gradient, relative to their size; or some roundings
+)
 
 
 class TimeStep:
@@ -34,9 +36,11 @@ class TimeStep:
     """
 
     _report: SolveReport  # of the last solve
-    _gradient: torch.Tensor  # (B, D + R, 3) of the energies at the held vertices, in the last solve [N]
+    _gradient: torch.Tensor  # (B, D + R, 3) of the energies at the held vertices, at last [N]
 
-    def __init__(self, equations: EquationsOfMotion, state: State, inputs: Inputs, constants: Constants) -> None:
+    def __init__(
+        self, equations: EquationsOfMotion, state: State, inputs: Inputs, constants: Constants
+    ) -> None:
         self.equations, self.workspace = equations, equations.workspace(state.batch)
         self.step = self._begin(state, inputs, constants)
 
@@ -48,7 +52,8 @@ class TimeStep:
         """Returns the terms of the incremental potential, differentiable.
 
         Args:
-            near: (B, N, 3) positions of the forces that depend on the pose; None: positions without forces [m].
+            near: (B, N, 3) positions of the forces that depend on the pose; None: positions without
+                forces [m].
         """
         return self.equations.energies.step_terms(self.step, near)
 
@@ -70,7 +75,11 @@ class TimeStep:
         return replace(new, v=new.v.index_copy(1, equations.fixed, moved / h))
 
     def reaction(
-        self, terms: StepTerms, x: torch.Tensor, gradient: torch.Tensor, missing: torch.Tensor | None = None
+        self,
+        terms: StepTerms,
+        x: torch.Tensor,
+        gradient: torch.Tensor,
+        missing: torch.Tensor | None = None,
     ) -> Reaction | None:
         """Returns the reaction at the held vertices, differentiable; None without such vertices.
 
@@ -87,19 +96,26 @@ class TimeStep:
         whole = replace(self.step, inputs=self.step.inputs.plus(missing, "internal"))
         internal = energies.internal_force(whole, x)
         reaction = self._at_known_velocity(reaction_of(self.workspace, terms, x, gradient, loads))
-        return reaction if reaction is None or internal is None else energies.internal.taken_up(reaction, internal, x)
+        return (
+            reaction
+            if reaction is None or internal is None
+            else energies.internal.taken_up(reaction, internal, x)
+        )
 
     def _at_known_velocity(self, reaction: Reaction | None) -> Reaction | None:
-        """Returns the reaction with the inertia of fixed vertices, whose velocity V at the end is prescribed.
+        """Returns the reaction with the inertia of fixed vertices,
+        whose velocity V at the end is prescribed.
 
-        The potential of a midpoint step has the acceleration 2 (V - v) / h of a vertex that moves by V h, as the
-        velocity of a free vertex would then be 2 V - v at the end; that of a fixed one is V (`finish`).
+        The potential of a midpoint step has the acceleration 2 (V - v) / h of a vertex that moves
+        by V h, as the velocity of a free vertex would then be 2 V - v at the end; that of a fixed
+        one is V (`finish`).
         """
         step, fixed = self.step, self.equations.fixed
         if reaction is None or step.stage.end == 1.0:
             return reaction
         mass, inputs = step.constants.mass, step.inputs
-        mass = (mass if inputs.attached_mass is None else mass + inputs.attached_mass)[:, fixed, None]
+        mass = mass if inputs.attached_mass is None else mass + inputs.attached_mass
+        mass = mass[:, fixed, None]
         velocity = (reaction.places[:, : len(fixed)] - step.state.q[:, fixed]) / step.stage.step
         excess = mass * (velocity - step.state.v[:, fixed]) / self.equations.time_step
         sliding = reaction.forces.shape[1] - len(fixed)
@@ -109,38 +125,55 @@ class TimeStep:
         """Returns the new state, differentiable, whose report says whether the solve has converged.
 
         Args:
-            near: (B, N, 3) predicted positions at the end of the step [m]; None: an extrapolation of the last steps.
+            near: (B, N, 3) predicted positions at the end of the step [m]; None: an extrapolation
+                of the last steps.
         """
         equations, workspace, state = self.equations, self.workspace, self.step.state
-        start = self.step.stage.target if near is None else equations.method.solution_for(state, near).detach()
+        start = (
+            self.step.stage.target
+            if near is None
+            else equations.method.solution_for(state, near).detach()
+        )
         if equations.energies.depends_on_pose(self.step):
             x = settle(self._minimised, start, _REMEDY)
             terms = self.terms(near=x)
         else:
             terms = self.terms()
             x = self._minimise(terms, start, workspace.follows(state.q))
-        new = replace(self.finish(x), report=self._report, reaction=self.reaction(terms, x, self._gradient))
+        new = replace(
+            self.finish(x), report=self._report, reaction=self.reaction(terms, x, self._gradient)
+        )
         workspace.record_positions(new.q)
         return new
 
-    def _minimise(self, terms: StepTerms, start: torch.Tensor, follows: torch.Tensor | None) -> torch.Tensor:
-        """Returns the solution (B, N, 3) [m]; sets its report, and the gradient at held vertices."""
+    def _minimise(
+        self, terms: StepTerms, start: torch.Tensor, follows: torch.Tensor | None
+    ) -> torch.Tensor:
+        """Returns the solution (B, N, 3) [m].
+
+        Sets its report, and the gradient at held vertices.
+        """
         equations = self.equations
         arguments = equations.settings, terms, start, self.fixed_positions(), follows
         x, self._report, self._gradient = equilibrium(self.workspace, "dynamics", *arguments)
         return equations.coordinates.expand(x)
 
     def _minimised(self, at: torch.Tensor) -> torch.Tensor:
-        """Returns the solution (B, N, 3) under forces at positions (B, N, 3), which stay where the solver fails [m]."""
+        """Returns the solution (B, N, 3) under forces at positions (B, N, 3),
+        which stay where the solver fails [m].
+        """
         x = self._minimise(self.terms(near=at), at.detach(), None)
         return torch.where(self._report.converged[:, None, None], x, at)
 
 
-def settle(solve: Callable[[torch.Tensor], torch.Tensor], start: torch.Tensor, failure: str) -> torch.Tensor:
-    """Returns the fixed point x = solve(x), differentiable in everything that the function depends on.
+def settle(
+    solve: Callable[[torch.Tensor], torch.Tensor], start: torch.Tensor, failure: str
+) -> torch.Tensor:
+    """Returns the fixed point x = solve(x), differentiable in everything
+    that the function depends on.
 
-    The gradient g by the solution fulfils g = w + (d solve / dx)^T g, for that of the loss w, and is found like the
-    solution, by iteration.
+    The gradient g by the solution fulfils g = w + (d solve / dx)^T g, for that of the loss w, and
+    is found like the solution, by iteration.
 
     Args:
         solve: equilibrium (B, N, 3) under forces at given positions [m], near which it lies.
@@ -170,7 +203,9 @@ def settle(solve: Callable[[torch.Tensor], torch.Tensor], start: torch.Tensor, f
     return solution
 
 
-def _repeated(function: Callable[[torch.Tensor], torch.Tensor], x: torch.Tensor, failure: str) -> torch.Tensor:
+def _repeated(
+    function: Callable[[torch.Tensor], torch.Tensor], x: torch.Tensor, failure: str
+) -> torch.Tensor:
     """Returns the limit of repeated calls of a function, or raises ConvergenceError."""
     settled = max(_SETTLED, 16.0 * torch.finfo(x.dtype).eps)
     for _ in range(_MOST_SETTLINGS):

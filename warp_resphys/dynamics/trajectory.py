@@ -20,7 +20,9 @@ from ..stepping.inputs import shapes
 from ..stepping.rollout import sample
 from ..stepping.state import Reaction, SolveReport, State
 
-_LOADS = tuple(f"load.{kind}{axis} [{unit}]" for kind, unit in (("f", "N"), ("t", "N m")) for axis in "xyz")
+_LOADS = tuple(
+    f"load.{kind}{axis} [{unit}]" for kind, unit in (("f", "N"), ("t", "N m")) for axis in "xyz"
+)
 
 
 @checks_methods("write_csv", "write_vtk", "write_usd", "save", "plot")
@@ -37,15 +39,18 @@ class Motion:
         reports: T solver reports.
         obstacles: T + 1 poses of the obstacles that the body touches; empty without obstacles.
         name: name of a robot and its model.
-        markers: (T + 1, B, M, 3) as `Robot.observe` returns them [m]; without a robot, the vertices.
+        markers: (T + 1, B, M, 3) as `Robot.observe` returns them [m]; without a robot, the
+            vertices.
         labels: names of the markers of a robot; empty where these are the vertices.
-        half_widths: (T + 1, B, M) half-widths of the prediction intervals of the markers' coordinates [m]; None without
-            intervals.
-        left: (T + 1, B) bool, whether the learned force has been evaluated outside its training range.
+        half_widths: (T + 1, B, M) half-widths of the prediction intervals of the markers'
+            coordinates [m]; None without intervals.
+        left: (T + 1, B) bool, whether the learned force has been evaluated outside its training
+            range.
         lost: (T + 1, B) bool, whether the simulation has diverged.
         inputs: (T, B, C) commands of a robot, by name.
         units: unit and names of the C parts of the commands that drive actuators, by name.
-        reaction: what holds the body, as in `State`, in each of the T steps; None where it is not known.
+        reaction: what holds the body, as in `State`, in each of the T steps; None where it is not
+            known.
     """
 
     q: torch.Tensor
@@ -72,21 +77,33 @@ class Motion:
 
     @classmethod
     def of(cls, states: Sequence[State], body: Body, time_step: float, **more: Any) -> "Motion":
-        """Returns the motion of a body in T + 1 states of a roll-out; ``more`` are other attributes."""
+        """Returns the motion of a body in T + 1 states of a roll-out.
+
+        ``more`` are other attributes.
+        """
         q, v = (torch.stack([getattr(state, name) for state in states]) for name in ("q", "v"))
         reports = [state.report for state in states[1:] if state.report is not None]
         reaction = Reaction.stack([state.reaction for state in states[1:]])
         return cls(q, v, states[-1], body, time_step, reports, reaction=reaction, **more)
 
     def __repr__(self) -> str:
-        """Number and length of the steps, environments, and how many left the training range or diverged."""
+        """Number and length of the steps, environments,
+        and how many left the training range or diverged.
+        """
         steps, batch = len(self.q) - 1, self.q.shape[1]
         text = f"Motion{f' of {self.name}' if self.name else ''}: {number_of(steps, 'step')} of "
-        text += f"{1e3 * self.time_step:g} ms, {number_of(batch, 'environment')}, {shapes({'q': self.q})[0]}"
-        left, lost = (None if flags is None else flags.cpu().numpy() for flags in (self.left, self.lost))
+        text += (
+            f"{1e3 * self.time_step:g} ms, {number_of(batch, 'environment')}, "
+            f"{shapes({'q': self.q})[0]}"
+        )
+        left, lost = (
+            None if flags is None else flags.cpu().numpy() for flags in (self.left, self.lost)
+        )
         if left is not None and left.any():
             first = self.times[left.any(axis=1).argmax()]
-            text += f"; {left.any(axis=0).sum()} left the training range, the first at {first:.3g} s"
+            text += (
+                f"; {left.any(axis=0).sum()} left the training range, the first at {first:.3g} s"
+            )
         return text + (f"; {lost[-1].sum()} diverged" if lost is not None and lost.any() else "")
 
     @property
@@ -95,12 +112,17 @@ class Motion:
         return self.time_step * np.arange(len(self.q), dtype=np.float64)
 
     def at(self, times: FloatArray | torch.Tensor) -> torch.Tensor:
-        """Interpolates the markers at other times (F,) [s]; returns (F, B, M, 3), by cubic interpolation [m]."""
+        """Interpolates the markers at other times (F,) [s].
+
+        Returns (F, B, M, 3), by cubic interpolation [m].
+        """
         wanted = torch.as_tensor(times).to(self.markers)
         if len(self.q) == 1:
             return self.markers.expand(len(wanted), -1, -1, -1)
         batch = self.q.shape[1]
-        return sample(self.markers.transpose(0, 1), wanted.expand(batch, -1), self.time_step).transpose(0, 1)
+        return sample(
+            self.markers.transpose(0, 1), wanted.expand(batch, -1), self.time_step
+        ).transpose(0, 1)
 
     def surface(self, environment: int = 0) -> ObstacleSurface:
         """Returns the surfaces of the obstacles in an environment, at all times."""
@@ -109,8 +131,8 @@ class Motion:
     def save(self, path: str | Path) -> Path:
         """Writes times, positions and velocities to an HDF5 file.
 
-        Its datasets are ``times`` (T + 1,), ``q`` and ``v`` (T + 1, B, N, 3) and ``rest`` (N, 3), each with an
-        attribute ``units``; ``markers`` (T + 1, B, M, 3) if there are any.
+        Its datasets are ``times`` (T + 1,), ``q`` and ``v`` (T + 1, B, N, 3) and ``rest`` (N, 3),
+        each with an attribute ``units``; ``markers`` (T + 1, B, M, 3) if there are any.
 
         Args:
             path: path of the file; missing folders are created.
@@ -118,7 +140,9 @@ class Motion:
         Raises:
             DataFileError: the file cannot be written.
         """
-        with atomic_hdf5(path, "trajectory", {"labels": list(self.labels)} if self.labels else None) as file:
+        with atomic_hdf5(
+            path, "trajectory", {"labels": list(self.labels)} if self.labels else None
+        ) as file:
             create(file, "times", self.times, "s")
             create(file, "q", _array(self.q), "m")
             create(file, "v", _array(self.v), "m/s")
@@ -138,13 +162,14 @@ class Motion:
         """Plots displacements over time, or the force that holds the body.
 
         Args:
-            vertices: vertex numbers, for example from `select_vertices`, or a single number: their mean displacement
-                from rest; by default the displacements of the markers since the start, or, without markers, that of the
-                vertex that moves furthest from rest.
+            vertices: vertex numbers, for example from `select_vertices`, or a single number: their
+                mean displacement from rest; by default the displacements of the markers since the
+                start, or, without markers, that of the vertex that moves furthest from rest.
             axis: ``x``, ``y`` or ``z``; by default the one with the largest displacement.
             environment: index of the environment.
             ax: matplotlib axes; a new figure if omitted.
-            reaction: whether the components of the force that holds the fixed vertices are shown instead [N].
+            reaction: whether the components of the force that holds the fixed vertices are shown
+                instead [N].
 
         Returns:
             The axes.
@@ -167,9 +192,13 @@ class Motion:
             moved = markers - markers[0]
         else:
             furthest = np.linalg.norm(q, axis=2).max(axis=0).argmax()
-            chosen = np.atleast_1d(np.asarray(furthest if vertices is None else vertices, dtype=np.int64))
+            chosen = np.atleast_1d(
+                np.asarray(furthest if vertices is None else vertices, dtype=np.int64)
+            )
             if not len(chosen) or chosen.min() < 0 or chosen.max() >= q.shape[1]:
-                raise InputError(f"the vertices to plot must be one or more of 0 to {q.shape[1] - 1}.")
+                raise InputError(
+                    f"the vertices to plot must be one or more of 0 to {q.shape[1] - 1}."
+                )
             moved = q[:, chosen].mean(1, keepdims=True)
         axis = "xyz"[int(np.nanmax(np.abs(moved), axis=(0, 1)).argmax())] if axis is None else axis
         if axis not in ("x", "y", "z"):
@@ -182,19 +211,25 @@ class Motion:
         return ax
 
     def write_csv(
-        self, path: str | Path, environment: int = 0, half_widths: bool = False, reaction: bool = False
+        self,
+        path: str | Path,
+        environment: int = 0,
+        half_widths: bool = False,
+        reaction: bool = False,
     ) -> Path:
-        """Writes a table of times, markers, and the commands of the step that led there, in SI units.
+        """Writes a table of times, markers, and commands of the step that led there, in SI units.
 
-        Its headers have names and units. `read_recording` reads tables without half-widths; the reaction is that of a
-        force sensor ``load`` whose readings are on the body.
+        Its headers have names and units. `read_recording` reads tables without half-widths; the
+        reaction is that of a force sensor ``load`` whose readings are on the body.
 
         Args:
             path: path of the file.
             environment: index of the environment.
-            half_widths: whether columns with the half-widths of the markers' prediction intervals are added.
-            reaction: whether columns ``load.fx [N]`` to ``load.tz [N m]`` are added, with the force that holds the
-                fixed vertices, and its moment about the origin; empty at the start, to which no step led.
+            half_widths: whether columns with the half-widths of the markers' prediction intervals
+                are added.
+            reaction: whether columns ``load.fx [N]`` to ``load.tz [N m]`` are added, with the force
+                that holds the fixed vertices, and its moment about the origin; empty at the start,
+                to which no step led.
 
         Raises:
             InputError: an unknown environment, or a motion without reaction.
@@ -206,17 +241,20 @@ class Motion:
             columns |= {f"{label} half-width [m]": width for label, width in widths}
         for name, (unit, parts) in self.units.items():
             if name in self.inputs:
-                columns |= input_columns(name, parts, unit, self.of_environment(self.inputs[name], environment))
+                columns |= input_columns(
+                    name, parts, unit, self.of_environment(self.inputs[name], environment)
+                )
         if reaction:
             columns |= self._loads(environment)
         return write_csv(Path(path), self.times, self.labels, markers, columns)
 
     def write_vtk(self, path: str | Path, environment: int = 0) -> Path:
-        """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with one file per step.
+        """Writes a time series for ParaView: a ``.pvd`` file,
+        and a folder of the same name with one file per step.
 
-        The vertices have ``displacement``, ``velocity`` and, if it is known, the ``reaction`` in the step that led
-        there [N]. Markers are in ``NAME_markers.pvd``, and obstacles in ``NAME_obstacles.pvd``, a half-space as
-        a plate.
+        The vertices have ``displacement``, ``velocity`` and, if it is known, the ``reaction`` in
+        the step that led there [N]. Markers are in ``NAME_markers.pvd``, and obstacles in
+        ``NAME_obstacles.pvd``, a half-space as a plate.
 
         Args:
             path: path of the ``.pvd`` file.
@@ -226,18 +264,29 @@ class Motion:
             InputError: an unknown environment or another extension.
             DataFileError: the files cannot be written.
         """
-        q, v, markers = (self.of_environment(values, environment) for values in (self.q, self.v, self.labelled))
+        q, v, markers = (
+            self.of_environment(values, environment) for values in (self.q, self.v, self.labelled)
+        )
         fields = dict[str, FloatArray]()
         if self.reaction is not None:
-            held, forces = self.reaction.vertices.cpu(), self.of_environment(self.reaction.forces, environment)
+            held = self.reaction.vertices.cpu()
+            forces = self.of_environment(self.reaction.forces, environment)
             fields["reaction"] = np.zeros_like(q)
             fields["reaction"][1:, held] = forces
         return write_vtk(
-            Path(path), self.body.mesh, self.times, q, v, markers, self.surface(environment).solids, fields
+            Path(path),
+            self.body.mesh,
+            self.times,
+            q,
+            v,
+            markers,
+            self.surface(environment).solids,
+            fields,
         )
 
     def write_usd(self, path: str | Path, environment: int = 0) -> Path:
-        """Writes the moving surfaces of the body and its obstacles, and its markers, to a USD file (extra ``usd``).
+        """Writes the moving surfaces of the body and its obstacles,
+        and its markers, to a USD file (extra ``usd``).
 
         Args:
             path: path of the ``.usd``, ``.usda`` or ``.usdc`` file.
@@ -247,8 +296,12 @@ class Motion:
             InputError: an unknown environment, another extension, or the extra is missing.
             DataFileError: the file cannot be written.
         """
-        q, markers = (self.of_environment(values, environment) for values in (self.q, self.labelled))
-        return write_usd(Path(path), self.body.mesh, self.times, q, markers, self.surface(environment).solids)
+        q, markers = (
+            self.of_environment(values, environment) for values in (self.q, self.labelled)
+        )
+        return write_usd(
+            Path(path), self.body.mesh, self.times, q, markers, self.surface(environment).solids
+        )
 
     @property
     def labelled(self) -> torch.Tensor:
@@ -256,9 +309,14 @@ class Motion:
         return self.markers if self.labels else self.markers[:, :, :0]
 
     def _loads(self, environment: int) -> dict[str, FloatArray]:
-        """Returns force [N] and moment about the origin [N m] of the reaction (T + 1,) by header, NaN at the start."""
+        """Returns force [N] and moment about the origin [N m] of the reaction (T + 1,)
+        by header, NaN at the start.
+        """
         if self.reaction is None or not len(self.body.fixed_vertices):
-            raise InputError("this motion has no reaction: nothing holds the body at fixed vertices, or no step did.")
+            raise InputError(
+                "this motion has no reaction: nothing holds the body "
+                "at fixed vertices, or no step did."
+            )
         clamp = self.reaction.at(self.body.fixed_vertices)
         values = self.of_environment(torch.cat([clamp.force, clamp.moment()], -1), environment)
         return dict(zip(_LOADS, np.concatenate([np.full((1, 6), np.nan), values]).T, strict=True))
@@ -270,7 +328,9 @@ class Motion:
             InputError: an unknown environment.
         """
         if not 0 <= environment < self.q.shape[1]:
-            raise InputError(f"environment is {environment}: there are {self.q.shape[1]}, numbered from 0.")
+            raise InputError(
+                f"environment is {environment}: there are {self.q.shape[1]}, numbered from 0."
+            )
         return _array(series[:, environment])
 
 

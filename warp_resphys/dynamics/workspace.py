@@ -28,19 +28,21 @@ T = TypeVar("T")
 Shard = tuple[slice, "Workspace"]
 
 
-def _kernels(energies: Sequence[PlacedEnergy], device: torch.device, dtype: torch.dtype) -> list[Any]:
-    """Returns a kernel of every module that a solve launches, but those of energies that are not materials."""
+def _kernels(
+    energies: Sequence[PlacedEnergy], device: torch.device, dtype: torch.dtype
+) -> list[Any]:
+    """Returns a kernel of every module that a solve launches,
+    but those of energies that are not materials.
+    """
     scalar = wp.float64 if dtype == torch.float64 else wp.float32
     solids = [placed.energy for placed in energies if isinstance(placed.energy, Solid)]
     return [
         *(points.gather_cells, points.set_kernels(3).gather, reductions.masked_norm),
         *(solid.kernel(device) for solid in solids),
-        *(
-            hessian_blocks.pair_kernel(3) if device.type == "cuda" else hessian_blocks.cell_blocks,
-            hessian_blocks.scatter_kernel(scalar),
-            minimisation.begin,
-            lbfgs_kernels(scalar).project,
-        ),
+        hessian_blocks.pair_kernel(3) if device.type == "cuda" else hessian_blocks.cell_blocks,
+        hessian_blocks.scatter_kernel(scalar),
+        minimisation.begin,
+        lbfgs_kernels(scalar).project,
         *(line_search.perturb, line_search.accept_kernel(scalar)),
     ]
 
@@ -74,7 +76,9 @@ class Workspace:
         dtype: torch.dtype,
     ) -> None:
         self.fixed = fixed
-        eliminated = torch.as_tensor(np.setdiff1d(np.arange(coordinates.n_vertices), pattern.free), device=device)
+        eliminated = torch.as_tensor(
+            np.setdiff1d(np.arange(coordinates.n_vertices), pattern.free), device=device
+        )
         start_quietly()
         compile_together(_kernels(energies, device, dtype), device, BLOCK)
         self.potential = IncrementalPotential(energies, coordinates, eliminated, batch, device)
@@ -94,11 +98,16 @@ class Workspace:
         self._last = q.detach()
 
     def follows(self, q: torch.Tensor) -> torch.Tensor | None:
-        """Returns (B,) whether positions are those at the end of the last time step; None before the first step."""
+        """Returns (B,) whether positions are those at the end of the last time step.
+
+        None before the first step.
+        """
         return None if self._last is None else (q.detach() == self._last).flatten(1).all(1)
 
     def cached(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Returns an object of this batch, made at the first use of its key, for use outside of inference mode too."""
+        """Returns an object of this batch, made at the first use of its key,
+        for use outside of inference mode too.
+        """
         if key not in self._cache:
             with lasting():
                 self._cache[key] = make()
@@ -108,14 +117,17 @@ class Workspace:
     def minimiser(self, purpose: str, settings: SolverSettings) -> Minimiser:
         """Returns the minimiser for a purpose (dynamics, statics), with a factor of its own."""
         return self.cached(
-            (purpose, settings), lambda: make_minimiser(self.potential, self.pattern, settings, self.dtype)
+            (purpose, settings),
+            lambda: make_minimiser(self.potential, self.pattern, settings, self.dtype),
         )
 
     def hessian(self, linear_solver: str, dtype: torch.dtype = torch.float64) -> ExactHessian:
         """Returns the exact Hessian, for adjoint solves."""
         return self.cached(
             (linear_solver, dtype),
-            lambda: ExactHessian(self.potential, self.pattern, self.linear_solver(linear_solver, dtype)),
+            lambda: ExactHessian(
+                self.potential, self.pattern, self.linear_solver(linear_solver, dtype)
+            ),
         )
 
     def linear_solver(self, name: str, dtype: torch.dtype = torch.float64) -> LinearSolver:

@@ -1,15 +1,17 @@
 """Interface of an energy: points, parameters, inputs, memory, kernels and derivatives.
 
-=================  =============  ===========================================================================
-class              one per        purpose
-=================  =============  ===========================================================================
-`Energy`           body           declares parameters (which can be identified) and inputs (functions
-                                  of time), and makes the other two
-`BoundEnergy`      simulator      turns parameters into values, begins and ends a step, declares its memory
-`Term`             batch          kernels on the points, and their arguments
-=================  =============  ===========================================================================
+==============  =========  ===================================================================
+class           one per    purpose
+==============  =========  ===================================================================
+`Energy`        body       declares parameters (which can be identified) and inputs (functions
+                           of time), and makes the other two
+`BoundEnergy`   simulator  turns parameters into values, begins and ends a step, declares its
+                           memory
+`Term`          batch      kernels on the points, and their arguments
+==============  =========  ===================================================================
 
-Simulator, solver, adjoint, tape, gradient check, identification and configuration use only this interface.
+Simulator, solver, adjoint, tape, gradient check, identification and configuration use only this
+interface.
 """
 
 from abc import ABC, abstractmethod
@@ -48,8 +50,9 @@ class Memory:
         shape = (batch, *self.shape)
         if isinstance(values, torch.Tensor) and tuple(values.shape) != shape:
             raise InputError(
-                f"state.memory[{self.name!r}] has shape {tuple(values.shape)}: it must be {shape} (environments, "
-                f"{self.per}s, ...); take the state from a simulator of this body, or leave the memory out."
+                f"state.memory[{self.name!r}] has shape {tuple(values.shape)}: it must be "
+                f"{shape} (environments, {self.per}s, ...); take the state from a simulator of "
+                "this body, or leave the memory out."
             )
         check_tensor(f"state.memory[{self.name!r}]", values, shape, self.unit, self.per, like)
 
@@ -82,7 +85,9 @@ class EnergySite:
 
     def tensor(self, values: Any) -> torch.Tensor:
         """Returns values with the simulator's device and dtype."""
-        return torch.as_tensor(values, device=self.rest_positions.device, dtype=self.rest_positions.dtype)
+        return torch.as_tensor(
+            values, device=self.rest_positions.device, dtype=self.rest_positions.dtype
+        )
 
 
 @dataclass(frozen=True)
@@ -91,8 +96,8 @@ class EnergyStep:
 
     state: State  # state at the start
     stage: ImplicitStage  # the implicit solve of the step
-    inputs: Mapping[str, torch.Tensor]  # inputs of the energy by name, without those that are not given
-    fixed_positions: torch.Tensor | None  # (B, D, 3) positions of the fixed vertices at the end of the step [m]
+    inputs: Mapping[str, torch.Tensor]  # inputs by name, without those that are not given
+    fixed_positions: torch.Tensor | None  # (B, D, 3) at the end of the step [m]
     values: Values  # values of the energy that follow from the parameters (`BoundEnergy.prepare`)
     gravity: torch.Tensor  # (1 or B, 3) [m/s^2]
     term: Term  # term of the energy for the state's batch
@@ -107,7 +112,8 @@ class Energy(ABC):
 
     Attributes:
         inputs: inputs of the energy, with `count` values each.
-        is_load: whether it is a load, which counts among the balancing forces in the convergence test.
+        is_load: whether it is a load, which counts among the balancing forces in the convergence
+            test.
         is_barrier: whether the energy is infinite at some positions (`Term.feasible`).
     """
 
@@ -117,16 +123,22 @@ class Energy(ABC):
 
     @property
     def parameters(self) -> tuple[Quantity, ...]:
-        """Parameters of the energy, by default those of its fields that are made by `stepping.quantity.parameter`."""
+        """Parameters of the energy, by default those of its fields that are made by
+        `stepping.quantity.parameter`.
+        """
         return tuple(quantities_of(self).values())
 
     @property
     def count(self) -> int:
-        """Number of parts (chambers, tendons), each with its own value of an input or a parameter."""
+        """Number of parts (chambers, tendons), each
+        with its own value of an input or a parameter.
+        """
         return 1
 
     def count_of(self, quantity: Quantity) -> int:
-        """Returns the number of values of a parameter or an input: `count`, or one that all parts share."""
+        """Returns the number of values of a parameter or an input:
+        `count`, or one that all parts share.
+        """
         del quantity
         return self.count
 
@@ -138,7 +150,9 @@ class Energy(ABC):
     @property
     def defaults(self) -> Mapping[str, Parameter]:
         """Default values of the parameters."""
-        return {quantity.name: getattr(self, name) for name, quantity in quantities_of(self).items()}
+        return {
+            quantity.name: getattr(self, name) for name, quantity in quantities_of(self).items()
+        }
 
     def __post_init__(self) -> None:
         """Raises InputError for a parameter out of range."""
@@ -165,7 +179,10 @@ class Energy(ABC):
         return self
 
     def bind(self, site: EnergySite) -> "BoundEnergy":
-        """Returns the energy on a simulator's device; overridden by energies with memory or values of a step."""
+        """Returns the energy on a simulator's device.
+
+        Overridden by energies with memory or values of a step.
+        """
         return BoundEnergy(self, site)
 
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -177,10 +194,14 @@ class Energy(ABC):
         Raises:
             InputError: another number of values than `count`.
         """
-        return {quantity.name: self.per_part(quantity, parameters[quantity.name]) for quantity in self.parameters}
+        return {
+            quantity.name: self.per_part(quantity, parameters[quantity.name])
+            for quantity in self.parameters
+        }
 
     def per_part(self, quantity: Quantity, values: torch.Tensor) -> torch.Tensor:
-        """Returns (1 or B, `count_of`) values of a parameter, or an array parameter (1 or B, *shape) unchanged.
+        """Returns (1 or B, `count_of`) values of a parameter, or an array parameter
+        (1 or B, *shape) unchanged.
 
         Raises:
             InputError: another number of values.
@@ -189,16 +210,19 @@ class Energy(ABC):
             return values
         count = self.count_of(quantity)
         if values.shape[1] not in (1, count):
-            per, named = quantity.per or "part", ", ".join(name for name in self.names if not name.isdigit())
+            per = quantity.per or "part"
+            named = ", ".join(name for name in self.names if not name.isdigit())
             raise InputError(
-                f"{quantity.name} has {values.shape[1]} values for {count} {per}s{named and f' ({named})'}: give one "
-                f"value, or one for each {per}."
+                f"{quantity.name} has {values.shape[1]} values for {count} "
+                f"{per}s{named and f' ({named})'}: give one value, or one for each {per}."
             )
         return values.expand(-1, count)
 
 
 class BoundEnergy:
-    """An energy in a simulator; this base class has no memory and no values that depend on the step.
+    """An energy in a simulator.
+
+    This base class has no memory and no values that depend on the step.
 
     Args:
         energy: the energy.
@@ -206,8 +230,8 @@ class BoundEnergy:
 
     Attributes:
         memory: memory variables.
-        rate_independent: whether a step depends on no time. Then a static equilibrium is a step too, with memory, and
-            `at_rest` is not used.
+        rate_independent: whether a step depends on no time. Then a static equilibrium is a step
+            too, with memory, and `at_rest` is not used.
     """
 
     memory: tuple[Memory, ...] = ()
@@ -217,7 +241,9 @@ class BoundEnergy:
         self.energy, self.site = energy, site
 
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
-        """Returns the values that follow from the parameters, computed once per roll-out (`Energy.prepare`)."""
+        """Returns the values that follow from the parameters,
+        computed once per roll-out (`Energy.prepare`).
+        """
         return dict(self.energy.prepare(parameters))
 
     def mass(self, parameters: Mapping[str, torch.Tensor]) -> Mass | None:
@@ -236,7 +262,8 @@ class BoundEnergy:
         return {}
 
     def at_pose(self, q: torch.Tensor, values: Values) -> dict[str, torch.Tensor | None]:
-        """Returns these values for an equilibrium whose forces depend on its own positions in ways without a potential.
+        """Returns these values for an equilibrium whose forces depend
+        on its own positions in ways without a potential.
 
         Args:
             q: (B, N, 3) the equilibrium, or positions near it [m].
@@ -251,7 +278,8 @@ class BoundEnergy:
         return None
 
     def load_at_fixed(self, q: torch.Tensor, values: Values) -> torch.Tensor | None:
-        """Returns what the forces (B, N, 3) at fixed vertices have beyond the energy's slope [N], or None.
+        """Returns what the forces (B, N, 3) at fixed vertices have beyond the energy's slope [N],
+        or None.
 
         Args:
             q: (B, N, 3) solution of a step or an equilibrium [m].
@@ -260,8 +288,12 @@ class BoundEnergy:
         del q, values
         return None
 
-    def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Returns the memory variables (B, ...) after a step, by name; called only if `memory` is not empty.
+    def end_step(
+        self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        """Returns the memory variables (B, ...) after a step, by name.
+
+        Called only if `memory` is not empty.
 
         Args:
             step: the step.
@@ -274,18 +306,28 @@ class BoundEnergy:
 
 @dataclass(frozen=True)
 class PlacedEnergy:
-    """An energy, its points in the simulator, and the prefix of its names there, such as ``tip_``."""
+    """An energy, its points in the simulator, and the prefix
+    of its names there, such as ``tip_``.
+    """
 
     energy: Energy
     points: tuple[Points, ...]  # points with operators on control vertices (`fem.coordinates`)
     prefix: str = ""
-    all_points: tuple[Points, ...] | None = None  # points with operators on all vertices; None if they are the same
+    all_points: tuple[Points, ...] | None = (
+        None  # points with operators on all vertices; None if they are the same
+    )
     body: Body | None = None  # body of the energy
     first: int = 0  # index of that body's first vertex in the simulator
 
     @classmethod
     def of(
-        cls, whole: Body, body: Body, first: int, energy: Energy, points: Sequence[Points], prefix: str = ""
+        cls,
+        whole: Body,
+        body: Body,
+        first: int,
+        energy: Energy,
+        points: Sequence[Points],
+        prefix: str = "",
     ) -> "PlacedEnergy":
         """Places an energy of a body in a simulator.
 
@@ -298,4 +340,6 @@ class PlacedEnergy:
             prefix: prefix of the energy's names.
         """
         shifted = tuple(item.shifted(first) for item in points)
-        return cls(energy, tuple(map(whole.coordinates.compose, shifted)), prefix, shifted, body, first)
+        return cls(
+            energy, tuple(map(whole.coordinates.compose, shifted)), prefix, shifted, body, first
+        )

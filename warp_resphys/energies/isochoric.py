@@ -1,17 +1,22 @@
-"""Nominal stress of isotropic rubber in homogeneous deformations that keep the volume, in closed form.
+"""Nominal stress of isotropic rubber in homogeneous deformations
+that keep the volume, in closed form.
 
-A test deforms its specimen along a path of principal stretches s(x) with s_1 s_2 s_3 = 1, where x is the nominal strain
-or the angle of shear. As the pressure does no work, the stress that a load cell shows over the undeformed cross-section
-is d/dx W(s(x)) (Ogden, Non-linear Elastic Deformations, 1984, section 7.2). With the energy of
-`kernels.materials.convex` it is linear in the coefficients:
+A test deforms its specimen along a path of principal stretches s(x) with s_1 s_2 s_3 = 1, where x
+is the nominal strain or the angle of shear. As the pressure does no work, the stress that a load
+cell shows over the undeformed cross-section is d/dx W(s(x)) (Ogden, Non-linear Elastic
+Deformations, 1984, section 7.2). With the energy of `kernels.materials.convex` it is linear in the
+coefficients:
 
-    tension, compression   s = (1 + x, (1 + x)^-1/2, (1 + x)^-1/2)   compression counts strain and stress as positive
-    biaxial                s = (1 + x, 1 + x, (1 + x)^-2)            stress of each of the two directions
+    tension, compression   s = (1 + x, (1 + x)^-1/2, (1 + x)^-1/2)   compression counts strain and
+                                                                     stress as positive
+    biaxial                s = (1 + x, 1 + x, (1 + x)^-2)            stress of each of the two
+                                                                     directions
     planar                 s = (1 + x, 1, 1 / (1 + x))               a wide strip, "pure shear"
     shear                  s_1 - 1 / s_1 = x, s_2 = 1                simple shear
 
-Relaxing branches and viscosity act through Green's strain E, as in `energies.viscosity`: the stress is S : dE/dx with
-S = 2 m H of a branch and S = 2 eta dE/dt of viscosity. `tests/energies/test_isochoric.py` compares with the simulator.
+Relaxing branches and viscosity act through Green's strain E, as in `energies.viscosity`: the stress
+is S : dE/dx with S = 2 m H of a branch and S = 2 eta dE/dt of viscosity.
+`tests/energies/test_isochoric.py` compares with the simulator.
 """
 
 import re
@@ -62,14 +67,17 @@ def path_of(kind: str, strain: FloatArray) -> DeformationPath:
 def stress_columns(
     kind: str, strain: FloatArray, terms: tuple[str, ...], seconds: FloatArray | None = None
 ) -> dict[str, FloatArray]:
-    """Returns the nominal stress (N,) of a coefficient of one, by its name; it is zero for volume terms.
+    """Returns the nominal stress (N,) of a coefficient of one, by its name.
+
+    It is zero for volume terms.
 
     Args:
         kind: one of `KINDS`.
         strain: (N,) nominal strains, or angles of shear [rad]; positive in compression, too.
-        terms: names of `energies.convex_material.ConvexMaterial`: elastic coefficients, ``shear_viscosity``, and
-            ``prony_TIME`` for a branch with a relaxation time [s].
-        seconds: (N,) rising times of the strains [s], which viscosity and branches need; they are relaxed at the first.
+        terms: names of `energies.convex_material.ConvexMaterial`: elastic coefficients,
+            ``shear_viscosity``, and ``prony_TIME`` for a branch with a relaxation time [s].
+        seconds: (N,) rising times of the strains [s], which viscosity and branches need; they are
+            relaxed at the first.
     """
     path = path_of(kind, strain)
     columns = {}
@@ -77,7 +85,11 @@ def stress_columns(
         if term == "shear_viscosity" or term.startswith("prony_"):
             assert seconds is not None
             rate = None if term == "shear_viscosity" else float(term.removeprefix("prony_"))
-            carried = _rate(path.green, seconds) if rate is None else _unrelaxed(path.green, seconds, rate)
+            carried = (
+                _rate(path.green, seconds)
+                if rate is None
+                else _unrelaxed(path.green, seconds, rate)
+            )
             column = 2.0 * np.einsum("nij,nij->n", carried, path.green_slopes)
         else:
             column = _elastic(term, path) if TERMS.fullmatch(term) else np.zeros_like(strain)
@@ -89,7 +101,9 @@ def stress(kind: str, strain: FloatArray, parameters: Mapping[str, float]) -> Fl
     """Returns the nominal stress (N,) [Pa] of a law in slow loading; see `stress_columns`."""
     known = {name: value for name, value in parameters.items() if TERMS.fullmatch(name)}
     columns = stress_columns(kind, strain, tuple(known))
-    return np.asarray(sum((value * columns[name] for name, value in known.items()), np.zeros_like(strain)))
+    return np.asarray(
+        sum((value * columns[name] for name, value in known.items()), np.zeros_like(strain))
+    )
 
 
 def shear_modulus(parameters: Mapping[str, float]) -> float:
@@ -98,7 +112,9 @@ def shear_modulus(parameters: Mapping[str, float]) -> float:
 
 
 def bulk_of(parameters: Mapping[str, float], poissons_ratio: float) -> float:
-    """Returns ``bulk_1`` of `energies.convex_material.ConvexMaterial` [Pa] for a Poisson's ratio at small strains."""
+    """Returns ``bulk_1`` of `energies.convex_material.ConvexMaterial` [Pa]
+    for a Poisson's ratio at small strains.
+    """
     return shear_modulus(parameters) * poissons_ratio / (1.0 - 2.0 * poissons_ratio)
 
 
@@ -114,13 +130,18 @@ def _elastic(term: str, path: DeformationPath) -> FloatArray:
 
 
 def _rate(green: FloatArray, seconds: FloatArray) -> FloatArray:
-    """Returns the rates (N, 3, 3) of strains at times (N,), of the interval before each; zero at the first."""
+    """Returns the rates (N, 3, 3) of strains at times (N,), of the interval before each.
+
+    Zero at the first.
+    """
     change = np.diff(green, axis=0) / np.diff(seconds)[:, None, None]
     return np.concatenate([np.zeros_like(green[:1]), change])
 
 
 def _unrelaxed(green: FloatArray, seconds: FloatArray, time: float) -> FloatArray:
-    """Returns the strain H (N, 3, 3) of a branch that has not relaxed, with a constant rate in each interval."""
+    """Returns the strain H (N, 3, 3) of a branch that has not relaxed,
+    with a constant rate in each interval.
+    """
     spans = np.diff(seconds) / time
     decay, gain = np.exp(-spans), -np.expm1(-spans) / spans
     result = np.zeros_like(green)

@@ -17,7 +17,9 @@ from ..kernels.modules import RecordedLaunch, launch_stream, shareable
 
 _GPU = RLock()  # Threads take turns on a GPU, whose stream they share.
 _MANY_POINTS = 10_000  # of a set, whose stresses a CPU's caches do not hold
-BLOCK = 128  # threads per block on a GPU; the same for all kernels, as Warp compiles a module once per block size
+# Threads per block on a GPU; the same for all kernels, as Warp compiles a module once per block
+# size.
+BLOCK = 128
 
 ensure_kernel_cache()  # before Warp is first used
 
@@ -39,16 +41,24 @@ def struct_of(kind: Any, /, **fields: Any) -> Any:
     return out
 
 
-def launch(kernel: Any, dim: Sequence[int], inputs: list[Any], outputs: list[Any], device: torch.device) -> None:
+def launch(
+    kernel: Any, dim: Sequence[int], inputs: list[Any], outputs: list[Any], device: torch.device
+) -> None:
     """Launches a kernel once, on torch's stream."""
     with shareable():
-        options: dict[str, Any] = {"block_dim": BLOCK, "device": str(device), "stream": launch_stream(device)}
+        options: dict[str, Any] = {
+            "block_dim": BLOCK,
+            "device": str(device),
+            "stream": launch_stream(device),
+        }
         wp.launch(kernel, dim=tuple(dim), inputs=inputs, outputs=outputs, **options)
 
 
 @contextmanager
 def lasting() -> Iterator[None]:
-    """Makes tensors that serve outside of ``torch.inference_mode`` too, without gradient if made there."""
+    """Makes tensors that serve outside of ``torch.inference_mode`` too,
+    without gradient if made there.
+    """
     if not torch.is_inference_mode_enabled():
         yield
         return
@@ -77,7 +87,9 @@ class Launcher:
         self.active = torch.ones(batch, device=device, dtype=torch.int32)
 
     def zeros(self, *shape: int) -> torch.Tensor:
-        """Returns zeros (B, *shape) on the launcher's device, which serve outside of inference mode, too."""
+        """Returns zeros (B, *shape) on the launcher's device,
+        which serve outside of inference mode, too.
+        """
         with lasting():
             return torch.zeros(self.batch, *shape, device=self.device, dtype=torch.float64)
 
@@ -86,27 +98,44 @@ class Launcher:
         with shareable():
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=str(self.device))
 
-    def record(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> Any:
+    def record(
+        self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]
+    ) -> Any:
         """Returns a recorded launch, for `launch`."""
-        options: dict[str, Any] = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
+        options: dict[str, Any] = {
+            "block_dim": BLOCK,
+            "device": str(self.device),
+            "record_cmd": True,
+        }
         with shareable():
-            return RecordedLaunch(wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, **options))
+            return RecordedLaunch(
+                wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, **options)
+            )
 
     def run(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
         """Launches a kernel once."""
         self.launch(self.record(kernel, dim, inputs, outputs))
 
     def record_blocks(self, kernel: Any, blocks: int, inputs: list[Any], outputs: list[Any]) -> Any:
-        """Returns a recorded launch with cooperating blocks of threads (one thread per block on a CPU)."""
-        options: dict[str, Any] = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
+        """Returns a recorded launch with cooperating blocks
+        of threads (one thread per block on a CPU).
+        """
+        options: dict[str, Any] = {
+            "block_dim": BLOCK,
+            "device": str(self.device),
+            "record_cmd": True,
+        }
         with shareable():
-            return RecordedLaunch(wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, **options))
+            return RecordedLaunch(
+                wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, **options)
+            )
 
     def gather(self, s: Any, stress: Any, out: torch.Tensor) -> Any:
-        """Returns a launch that adds the transposed operators applied to a set's stress to ``out`` (B, N, 3).
+        """Returns a launch that adds the transposed operators applied
+        to a set's stress to ``out`` (B, N, 3).
 
-        With ``by_cells``, or many points and several of them in a cell, there are two launches, which read the stress
-        of a cell once for all its nodes.
+        With ``by_cells``, or many points and several of them in a cell, there are two launches,
+        which read the stress of a cell once for all its nodes.
         """
         outputs, kernels = [warp_view(out, wp.vec3d)], points.set_kernels(s.width)
         if not self.by_cells and (s.points_per_cell == 1 or s.n_points < _MANY_POINTS):
@@ -116,24 +145,35 @@ class Launcher:
         cells, active = (self.batch, s.cells * s.nodes_per_cell), warp_view(self.active, wp.int32)
         return LaunchSequence(
             self.record(kernels.cell_forces, cells, [active, s.points, stress], forces),
-            self.record(points.gather_cells, (self.batch, out.shape[1]), [s.start, s.incident, *forces], outputs),
+            self.record(
+                points.gather_cells,
+                (self.batch, out.shape[1]),
+                [s.start, s.incident, *forces],
+                outputs,
+            ),
         )
 
     def product(self, s: Any, tangent: Any, direction: Any, stress: Any) -> Any:
-        """Returns a launch that computes a set's stress from its tangent (B, P, blocks) and a direction (B, N)."""
+        """Returns a launch that computes a set's stress
+        from its tangent (B, P, blocks) and a direction (B, N).
+        """
         inputs = [s.points, tangent, direction]
         kernel = points.set_kernels(s.width).tangent_product
         return self.record(kernel, (self.batch, s.n_points), inputs, [stress])
 
     def capture(self, *commands: Any) -> "CapturedGraph | LaunchSequence":
-        """Returns recorded launches as one graph, also on a CPU, where it costs a sixth of the single launches.
+        """Returns recorded launches as one graph, also on a CPU,
+        where it costs a sixth of the single launches.
 
         Between those that the host makes (`HostLaunches`) there are several graphs.
         """
         if not any(isinstance(command, HostLaunches) for command in commands):
             return self.capture_calls(lambda: issue(*commands), commands)
         groups = itertools.groupby(commands, lambda command: isinstance(command, HostLaunches))
-        parts = [group if by_host else [self.capture(*group)] for by_host, group in ((k, list(g)) for k, g in groups)]
+        parts = [
+            group if by_host else [self.capture(*group)]
+            for by_host, group in ((k, list(g)) for k, g in groups)
+        ]
         return LaunchSequence(*itertools.chain(*parts))
 
     def capture_calls(self, calls: Callable[[], None], commands: Iterable[Any]) -> "CapturedGraph":

@@ -2,12 +2,14 @@ r"""Surrounding medium: drag, added mass and buoyancy.
 
 The force per area on a surface with normal n and velocity v is, for the density rho of the medium,
 
-    -c v - rho / 2 (C_n |v . n| (v . n) n + C_t |v_t| v_t) - rho l (n . dv/dt) n,     v_t = v - (v . n) n
+    -c v - rho / 2 (C_n |v . n| (v . n) n + C_t |v_t| v_t) - rho l (n . dv/dt) n,
+    v_t = v - (v . n) n
 
-(the resistive force of Taylor, Proc. R. Soc. A 214, 1952, for swimming, and a reactive one; Lighthill 1971). c is the
-linear drag of creeping flow [N s/m^3], C_n and C_t are normal and tangential drag coefficients, and l is the thickness
-of the layer of medium that moves with the surface [m]. The force acts at the end of an implicit stage, with areas and
-normals of its start, so that it derives from a convex potential and drag is dissipative.
+(the resistive force of Taylor, Proc. R. Soc. A 214, 1952, for swimming, and a reactive one;
+Lighthill 1971). c is the linear drag of creeping flow [N s/m^3], C_n and C_t are normal and
+tangential drag coefficients, and l is the thickness of the layer of medium that moves with the
+surface [m]. The force acts at the end of an implicit stage, with areas and normals of its start, so
+that it derives from a convex potential and drag is dissipative.
 """
 
 from collections.abc import Sequence
@@ -43,8 +45,8 @@ class FacePoints(Points):
 class Medium(Energy):
     """Drag, added mass and buoyancy on the surface of a body (equation in the module's docstring).
 
-    Parameters are ``medium_density`` [kg/m^3], ``drag_linear`` [N s/m^3], ``drag_normal``, ``drag_tangential`` and
-    ``added_layer`` [m].
+    Parameters are ``medium_density`` [kg/m^3], ``drag_linear`` [N s/m^3], ``drag_normal``,
+    ``drag_tangential`` and ``added_layer`` [m].
 
     Raises:
         InputError: a value out of range, or faces that do not belong to the surface.
@@ -57,7 +59,9 @@ class Medium(Energy):
     tangential: Parameter = parameter(0.0, "drag_tangential", "", closed=True)
     layer: Parameter = parameter(0.0, "added_layer", "m", closed=True)
     buoyancy: bool = True  # whether buoyancy acts
-    faces: NDArray[np.int64] | None = None  # (F, n) faces, among `boundary_faces`, that the medium acts on; None: all
+    faces: NDArray[np.int64] | None = (
+        None  # (F, n) faces, among `boundary_faces`, that the medium acts on; None: all
+    )
 
     @override
     def points(self, mesh: Mesh) -> tuple[FacePoints, ...]:
@@ -66,7 +70,10 @@ class Medium(Energy):
         faces = surface if self.faces is None else np.asarray(self.faces)
         boundary = {tuple(sorted(face)) for face in surface.tolist()}
         if not len(faces) or not all(tuple(sorted(face)) in boundary for face in faces.tolist()):
-            raise InputError("the faces that a medium acts on must belong to the body's surface (boundary_faces).")
+            raise InputError(
+                "the faces that a medium acts on must belong to the body's surface "
+                "(boundary_faces)."
+            )
         face = FACES[faces.shape[1]]
         places, weights = face.rule(2)
         values, slopes = face.shape(places)
@@ -106,7 +113,10 @@ class BoundMedium(BoundEnergy):
         density, linear, normal, tangential, layer = map(step.value, names)
         drag = 0.5 * density / h**2
         coefficients = torch.cat(
-            torch.broadcast_tensors(linear / h, drag * normal, drag * tangential, density * layer / h**2), 1
+            torch.broadcast_tensors(
+                linear / h, drag * normal, drag * tangential, density * layer / h**2
+            ),
+            1,
         )
         return {
             "medium_reference": self._at_points(stage.velocity_reference),
@@ -132,7 +142,9 @@ class BoundMedium(BoundEnergy):
 
     def _at_points(self, field: torch.Tensor) -> torch.Tensor:
         """Interpolates a vertex field (B, N, 3) to the points (B, P, 3)."""
-        return torch.einsum("qk,bfki->bfqi", self._shape_values, field[:, self._nodes]).flatten(1, 2)
+        return torch.einsum("qk,bfki->bfqi", self._shape_values, field[:, self._nodes]).flatten(
+            1, 2
+        )
 
 
 class MediumTerm(Term):
@@ -142,7 +154,9 @@ class MediumTerm(Term):
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet]) -> None:
         (s,) = sets
-        places = dict.fromkeys(("medium_reference", "medium_target", "medium_area"), (s.n_points, 3))
+        places = dict.fromkeys(
+            ("medium_reference", "medium_target", "medium_area"), (s.n_points, 3)
+        )
         super().__init__(launcher, sets, {**places, "medium_coefficients": (1, 4)})
         self._nodes = torch.as_tensor(s.source.nodes, device=s.device)  # (C, K)
         self._weights = torch.as_tensor(s.source.gradients[..., 0], device=s.device)  # (C, Q, K)
@@ -156,19 +170,27 @@ class MediumTerm(Term):
     @override
     def curvature(self) -> torch.Tensor:
         coefficients = self.values["medium_coefficients"]
-        return self.values["medium_area"].norm(dim=-1) * (coefficients[..., 0] + coefficients[..., 3])
+        return self.values["medium_area"].norm(dim=-1) * (
+            coefficients[..., 0] + coefficients[..., 3]
+        )
 
     @override
     def adjoint(self, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         """Implements `Term.adjoint` by differentiating the forces in torch."""
 
         def at_points(field: torch.Tensor) -> torch.Tensor:
-            return torch.einsum("cqk,bcki->bcqi", self._weights, field[:, self._nodes]).flatten(1, 2)
+            return torch.einsum("cqk,bcki->bcqi", self._weights, field[:, self._nodes]).flatten(
+                1, 2
+            )
 
         def differentiate() -> dict[str, torch.Tensor]:
             with torch.enable_grad():
-                leaves = {name: value.detach().requires_grad_() for name, value in self.values.items()}
-                loss = -(_forces(at_points(positions), *leaves.values()) * at_points(direction)).sum()
+                leaves = {
+                    name: value.detach().requires_grad_() for name, value in self.values.items()
+                }
+                loss = -(
+                    _forces(at_points(positions), *leaves.values()) * at_points(direction)
+                ).sum()
                 slopes = torch.autograd.grad(loss, list(leaves.values()))
             return dict(zip(leaves, slopes, strict=True))
 
@@ -176,9 +198,13 @@ class MediumTerm(Term):
 
 
 def _forces(
-    x: torch.Tensor, reference: torch.Tensor, target: torch.Tensor, area: torch.Tensor, coefficients: torch.Tensor
+    x: torch.Tensor,
+    reference: torch.Tensor,
+    target: torch.Tensor,
+    area: torch.Tensor,
+    coefficients: torch.Tensor,
 ) -> torch.Tensor:
-    """Returns the derivative (B, P, 3) of the energy in `kernels.fluid_drag` by the positions of the points."""
+    """The derivative (B, P, 3) of the energy in `kernels.fluid_drag` by positions of points."""
     size = area.norm(dim=-1, keepdim=True)
     n, d = area / size.clamp_min(1e-30), x - reference
     across, inertial = ((way * n).sum(-1, keepdim=True) for way in (d, x - target))
@@ -186,4 +212,8 @@ def _forces(
     square = along.square().sum(-1, keepdim=True)
     slip = torch.where(square > 0.0, square.clamp_min(1e-300).sqrt(), 0.0)
     linear, normal, tangential, mass = coefficients[..., None].unbind(-2)
-    return size * (linear * d + (normal * across.abs() * across + mass * inertial) * n + tangential * slip * along)
+    return size * (
+        linear * d
+        + (normal * across.abs() * across + mass * inertial) * n
+        + tangential * slip * along
+    )

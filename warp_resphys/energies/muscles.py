@@ -2,12 +2,14 @@ r"""Muscles: contractile fibres along a direction in some cells of a solid.
 
 At a point with the fibre direction a the stretch is lambda = |F a|, and the energy per volume is
 
-    sigma lambda + k s(lambda - 1 + c),     tension  t = sigma + k s'(lambda - 1 + c)   [Pa of the rest shape],
+    sigma lambda + k s(lambda - 1 + c),
+    tension  t = sigma + k s'(lambda - 1 + c)   [Pa of the rest shape],
 
-with an active stress sigma, and a tension-only fibre of stiffness k shortened by an active contraction c; s(e) is
-max(e, 0)^2 / 2, smoothed over a short strain (`kernels.axial.muscle_pull`). A negative stress pushes, like an inflated
-chamber whose walls are not modelled. Without inputs the fibres are a reinforcement that stiffens the solid in tension
-(Spencer, Continuum Theory of the Mechanics of Fibre-Reinforced Composites, 1984), but not in compression.
+with an active stress sigma, and a tension-only fibre of stiffness k shortened by an active
+contraction c; s(e) is max(e, 0)^2 / 2, smoothed over a short strain (`kernels.axial.muscle_pull`).
+A negative stress pushes, like an inflated chamber whose walls are not modelled. Without inputs the
+fibres are a reinforcement that stiffens the solid in tension (Spencer, Continuum Theory of the
+Mechanics of Fibre-Reinforced Composites, 1984), but not in compression.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,10 +31,20 @@ from .launcher import Launcher
 from .term import LawTerm, PartPoints, PointSet
 
 STRESS = Quantity(
-    *("muscle_stress", "Pa"), per="muscle", typical=1e4, words="stress", shown_unit="kPa", shown_factor=1e-3
+    *("muscle_stress", "Pa"),
+    per="muscle",
+    typical=1e4,
+    words="stress",
+    shown_unit="kPa",
+    shown_factor=1e-3,
 )
 CONTRACTION = Quantity(
-    *("muscle_contraction", ""), per="muscle", typical=0.05, words="contraction", shown_unit="%", shown_factor=1e2
+    *("muscle_contraction", ""),
+    per="muscle",
+    typical=0.05,
+    words="contraction",
+    shown_unit="%",
+    shown_factor=1e2,
 )
 
 
@@ -55,12 +67,12 @@ class Muscle:
 class Muscles(Energy):
     """Contractile fibres (equation in the module's docstring).
 
-    Inputs are ``muscle_stress`` [Pa] and ``muscle_contraction`` (a fraction of the fibres' length), the parameter is
-    ``muscle_stiffness`` [Pa], with one value per muscle.
+    Inputs are ``muscle_stress`` [Pa] and ``muscle_contraction`` (a fraction of the fibres' length),
+    the parameter is ``muscle_stiffness`` [Pa], with one value per muscle.
 
     Raises:
-        InputError: no muscle, one without cells, a direction that is zero, not finite or of another shape, or a
-            negative stiffness.
+        InputError: no muscle, one without cells, a direction that is zero, not finite or of another
+            shape, or a negative stiffness.
     """
 
     inputs: ClassVar[tuple[Quantity, ...]] = (STRESS, CONTRACTION)
@@ -73,30 +85,42 @@ class Muscles(Energy):
 
     @override
     def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> "Muscles":
-        turned = [replace(muscle, direction=np.asarray(muscle.direction) @ rotation.T) for muscle in self.muscles]
+        turned = [
+            replace(muscle, direction=np.asarray(muscle.direction) @ rotation.T)
+            for muscle in self.muscles
+        ]
         return replace(self, muscles=turned)
 
     def __post_init__(self) -> None:
         """Checks the values."""
         if not self.muscles:
-            raise InputError("there is no muscle: name the cells and the direction of each, or leave the muscles out.")
+            raise InputError(
+                "there is no muscle: name the cells and the direction of each, "
+                "or leave the muscles out."
+            )
         if len(set(self.names)) != self.count:
-            raise InputError(f"muscles are called {', '.join(self.names)}: give each a name of its own.")
+            raise InputError(
+                f"muscles are called {', '.join(self.names)}: give each a name of its own."
+            )
         for name, muscle in zip(self.names, self.muscles, strict=True):
-            cells, direction = np.asarray(muscle.cells), np.asarray(muscle.direction, dtype=np.float64)
+            cells = np.asarray(muscle.cells)
+            direction = np.asarray(muscle.direction, dtype=np.float64)
             if cells.ndim != 1 or not cells.size or not np.issubdtype(cells.dtype, np.integer):
                 raise InputError(
-                    f"the muscle '{name}' has cells of shape {cells.shape}: give the numbers of one or more."
+                    f"the muscle '{name}' has cells of shape {cells.shape}: "
+                    "give the numbers of one or more."
                 )
             if direction.shape not in ((3,), (len(cells), 3)):
                 raise InputError(
-                    f"the muscle '{name}' has directions of shape {direction.shape}: give (3,), or one for each of its "
-                    f"{len(cells)} cells."
+                    f"the muscle '{name}' has directions of shape {direction.shape}: give (3,), "
+                    f"or one for each of its {len(cells)} cells."
                 )
             if not np.isfinite(direction).all() or not np.linalg.norm(direction, axis=-1).all():
                 raise InputError(f"the muscle '{name}' has a direction that is zero or not finite.")
         if not (np.isfinite(self.toe) and self.toe > 0.0):
-            raise InputError(f"the strain over which muscle fibres tighten is {self.toe:g}: it must be positive.")
+            raise InputError(
+                f"the strain over which muscle fibres tighten is {self.toe:g}: it must be positive."
+            )
         super().__post_init__()
 
     @property
@@ -107,7 +131,9 @@ class Muscles(Energy):
     @property
     @override
     def names(self) -> tuple[str, ...]:
-        return tuple(muscle.name or f"muscle_{number}" for number, muscle in enumerate(self.muscles, 1))
+        return tuple(
+            muscle.name or f"muscle_{number}" for number, muscle in enumerate(self.muscles, 1)
+        )
 
     @override
     def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:
@@ -122,8 +148,13 @@ class Muscles(Energy):
             cells = np.asarray(muscle.cells, dtype=np.int64)
             wrong = cells[(cells < 0) | (cells >= len(mesh.cells))]
             if len(wrong):
-                raise InputError(f"the muscle '{name}' runs through cell {wrong[0]}, but there are {len(mesh.cells)}.")
-            direction = np.broadcast_to(np.asarray(muscle.direction, dtype=np.float64), (len(cells), 3))
+                raise InputError(
+                    f"the muscle '{name}' runs through cell {wrong[0]}, but there are "
+                    f"{len(mesh.cells)}."
+                )
+            direction = np.broadcast_to(
+                np.asarray(muscle.direction, dtype=np.float64), (len(cells), 3)
+            )
             unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
             gradients, determinants = physical_gradients(
                 mesh.vertices, mesh.cells[cells], mesh.element.shape(points)[1]
@@ -135,7 +166,9 @@ class Muscles(Energy):
         return (PartPoints(*map(np.concatenate, (nodes, operators, numbers, volumes))),)
 
     def lines(self, mesh: Mesh) -> dict[str, NDArray[np.float64]]:
-        """Returns a line (2, 3) through the centre of each muscle, over the extent of its cells [m], by name."""
+        """Returns a line (2, 3) through the centre of each muscle,
+        over the extent of its cells [m], by name.
+        """
         lines = {}
         for name, muscle in zip(self.names, self.muscles, strict=True):
             corners = mesh.vertices[np.unique(mesh.cells[np.asarray(muscle.cells)])]
@@ -148,9 +181,13 @@ class Muscles(Energy):
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> LawTerm:
-        shapes = dict.fromkeys(("muscle_stress", "muscle_contraction", "muscle_stiffness"), (self.count,))
+        shapes = dict.fromkeys(
+            ("muscle_stress", "muscle_contraction", "muscle_stiffness"), (self.count,)
+        )
 
         def stiffness(values: Mapping[str, torch.Tensor]) -> torch.Tensor:
             return values["muscle_stress"].clamp_min(0.0) + values["muscle_stiffness"]
 
-        return LawTerm(launcher, sets, MUSCLE, shapes, self.count, constants=[self.toe], stiffness=stiffness)
+        return LawTerm(
+            launcher, sets, MUSCLE, shapes, self.count, constants=[self.toe], stiffness=stiffness
+        )

@@ -4,8 +4,9 @@ One time step of every integrator, and a static equilibrium too, is the minimum 
 
     sum_i k_i / 2 |x_i - y_i|^2 - f . x + sum_e E_e(x)
 
-with the mass over the square of the effective time step k, the inertial target y, the loads f, and the energies E_e:
-those of the solid, elastic and dissipative, and others such as -p V of chambers under pressure.
+with the mass over the square of the effective time step k, the inertial target y, the loads f, and
+the energies E_e: those of the solid, elastic and dissipative, and others such as -p V of chambers
+under pressure.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -34,7 +35,8 @@ class StepTerms:
     target: torch.Tensor  # (B, N, 3) y [m]
     inertia: torch.Tensor  # (B, N) k [N/m]
     force: torch.Tensor  # (B, N, 3) f [N]
-    # values of each energy's term by name (`Term.values`), with a first axis of 1 or B; None if not needed
+    # values of each energy's term by name (`Term.values`), with a first axis of 1 or B; None if not
+    # needed
     values: Sequence[Values] = ()
 
     @classmethod
@@ -61,27 +63,30 @@ class IncrementalPotential(Launcher):
 
     Attributes:
         energies: terms of the energies.
-        stiffness: (B,) sum of the solids' moduli times volumes, the scale of the energy's rounding error [J].
+        stiffness: (B,) sum of the solids' moduli times volumes, the scale of the energy's rounding
+            error [J].
         value_names: number of the energy and name of every value of the terms.
         sets: sets of points of all energies.
         free_mask: (N,) one at free vertices, zero at fixed ones.
         coordinates: the map on the potential's device, in float64.
-        evaluation: launches that evaluate at ``positions`` and set ``residual`` and what follows here. Environments
-            that are not ``active`` keep energies, norm of the residual and ``held_gradient``, and have no valid
-            ``residual``.
-        held_gradient: (B, N, 3) gradient of the energies at fixed vertices, and its part normal to symmetry planes at
-            vertices that slide in them; zero at others [N].
+        evaluation: launches that evaluate at ``positions`` and set ``residual`` and what follows
+            here. Environments that are not ``active`` keep energies, norm of the residual and
+            ``held_gradient``, and have no valid ``residual``.
+        held_gradient: (B, N, 3) gradient of the energies at fixed vertices, and its part normal to
+            symmetry planes at vertices that slide in them; zero at others [N].
         energy: (B,) [J].
         energy_size: (B,) sum of the absolute values of the energies [J].
         balance: (B,) norm of inertia less all loads [N].
         residual_norm: (B,) norm of the residual [N].
-        low_rank: (B, 3 N, r) columns C of the last `update_tangent`; the Hessian has C C^T besides `tangents`. Or None.
+        low_rank: (B, 3 N, r) columns C of the last `update_tangent`; the Hessian has C C^T besides
+            `tangents`. Or None.
         tangent_active: (B,) zero for environments whose tangent is not updated.
         clamp: (B,) non-zero for environments with eigenvalues clamped at zero.
         last_pair_tangents: `pair_tangents` of the last `update_tangent`.
         all_active: whether the last `update_tangent` was for all environments.
         tangent_launches: launches that set `tangents`, available after their first use.
-        on_direction: is called before each global step of a minimisation, unless a GPU runs all of it.
+        on_direction: is called before each global step of a minimisation, unless a GPU runs all of
+            it.
     """
 
     tangent_launches: CapturedGraph | LaunchSequence
@@ -97,7 +102,9 @@ class IncrementalPotential(Launcher):
         super().__init__(batch, device)
         self.on_direction: Callable[[], None] = lambda: None
         self.n_vertices = n_vertices = coordinates.n_vertices
-        self.coordinates = DeviceCoordinates(coordinates, torch.empty(0, device=device, dtype=torch.float64))
+        self.coordinates = DeviceCoordinates(
+            coordinates, torch.empty(0, device=device, dtype=torch.float64)
+        )
         self.energies: list[Term] = []
         self.sets: list[PointSet] = []
         self._n_points = 0
@@ -108,7 +115,9 @@ class IncrementalPotential(Launcher):
             for points in placed.points:
                 first, self._n_points = self._n_points, self._n_points + points.n_points
                 in_energy = slice(first - start, self._n_points - start)
-                sets.append(PointSet(self, points, n_vertices, slice(first, self._n_points), in_energy))
+                sets.append(
+                    PointSet(self, points, n_vertices, slice(first, self._n_points), in_energy)
+                )
             self.energies.append(placed.energy.term(self, sets))
             self.sets += sets
         self.free_mask = torch.ones(n_vertices, device=device, dtype=torch.float64)
@@ -117,20 +126,28 @@ class IncrementalPotential(Launcher):
         self._feasible = [start for start in starts if start is not None]
         fields = self.zeros(n_vertices, 3), self.zeros(n_vertices), self.zeros(n_vertices, 3)
         self.terms = StepTerms(*fields, [term.values for term in self.energies])
-        self.value_names = tuple((k, name) for k, term in enumerate(self.energies) for name in term.values)
+        self.value_names = tuple(
+            (k, name) for k, term in enumerate(self.energies) for name in term.values
+        )
         self.stiffness = self.zeros()
         self.positions = self.zeros(n_vertices, 3)
         self._position_view = warp_view(self.positions, wp.vec3d)
         self.residual, self.held_gradient = self.zeros(n_vertices, 3), self.zeros(n_vertices, 3)
         self._point_energy = self.zeros(self._n_points)
         self._vertex_energy = self.zeros(n_vertices)
-        self.energy, self.energy_size, self.balance, self.residual_norm = (self.zeros() for _ in range(4))
+        self.energy, self.energy_size, self.balance, self.residual_norm = (
+            self.zeros() for _ in range(4)
+        )
         self._record_evaluation()
         self._tangents: list[torch.Tensor] = []
-        self.tangent_active, self.clamp = (torch.zeros(batch, device=device, dtype=torch.int32) for _ in range(2))
+        self.tangent_active, self.clamp = (
+            torch.zeros(batch, device=device, dtype=torch.int32) for _ in range(2)
+        )
         self.all_active = True
         self.low_rank: torch.Tensor | None = None
-        self._stiff_columns: torch.Tensor | None = None  # the same, with components normal to symmetry planes
+        self._stiff_columns: torch.Tensor | None = (
+            None  # the same, with components normal to symmetry planes
+        )
         self._direction = self.zeros(n_vertices, 3)
         self._adjoints: list[Callable[[], dict[str, torch.Tensor]]] = []
 
@@ -168,15 +185,27 @@ class IncrementalPotential(Launcher):
         free, residual = warp_view(self.free_mask, wp.float64), warp_view(self.residual, wp.vec3d)
         sums, c = [warp_view(self.held_gradient, wp.vec3d)], self.coordinates
         if c.slides:  # removes the residual normal to symmetry planes
-            planes = [self.upload(c.sliding.cpu().numpy().astype(np.int32), int), warp_view(c.projections, wp.mat33d)]
+            planes = [
+                self.upload(c.sliding.cpu().numpy().astype(np.int32), int),
+                warp_view(c.projections, wp.mat33d),
+            ]
             for first, commands in enumerate((self._internal_commands, self._load_commands)):
                 inputs = [active, *planes, first]
-                commands.append(self.record(kernels.project, (b, len(c.sliding)), inputs, [residual, *sums]))
+                commands.append(
+                    self.record(kernels.project, (b, len(c.sliding)), inputs, [residual, *sums])
+                )
         self._load_commands.append(
-            self.record_blocks(reductions.masked_norm, b, [free, residual], [warp_view(self.balance, wp.float64)])
+            self.record_blocks(
+                reductions.masked_norm, b, [free, residual], [warp_view(self.balance, wp.float64)]
+            )
         )
-        energies = [warp_view(values, wp.float64) for values in (self._vertex_energy, self._point_energy)]
-        sums += [warp_view(values, wp.float64) for values in (self.energy, self.energy_size, self.residual_norm)]
+        energies = [
+            warp_view(values, wp.float64) for values in (self._vertex_energy, self._point_energy)
+        ]
+        sums += [
+            warp_view(values, wp.float64)
+            for values in (self.energy, self.energy_size, self.residual_norm)
+        ]
         self._internal_commands.append(
             self.record_blocks(reductions.totals, b, [active, free, *energies, residual], sums)
         )
@@ -184,7 +213,9 @@ class IncrementalPotential(Launcher):
         self._evaluation = self.capture(*self.evaluation)
 
     def restrict(self, field: torch.Tensor) -> torch.Tensor:
-        """Returns a field (B, N, 3, ...) that is zero at vertices without unknowns and normal to symmetry planes."""
+        """Returns a field (B, N, 3, ...) that is zero at vertices
+        without unknowns and normal to symmetry planes.
+        """
         mask = self.free_mask.view(-1, *[1] * (field.ndim - 2))
         return self.coordinates.restrict(field * mask)
 
@@ -195,7 +226,11 @@ class IncrementalPotential(Launcher):
         if self.coordinates.slides:
             mine.target.copy_(self.coordinates.hold(mine.target))
         torch.mul(terms.inertia.detach(), self.free_mask, out=mine.inertia)
-        torch.mul(self.coordinates.restrict(terms.force.detach().double()), self.free_mask[:, None], out=mine.force)
+        torch.mul(
+            self.coordinates.restrict(terms.force.detach().double()),
+            self.free_mask[:, None],
+            out=mine.force,
+        )
         for term, values in zip(self.energies, terms.values, strict=True):
             for name, buffer in term.values.items():
                 if (value := values[name]) is not None:
@@ -214,14 +249,18 @@ class IncrementalPotential(Launcher):
         return self.terms.inertia
 
     def evaluate(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the energy (B,) [J] and `balance` (B,) [N] at ``positions``; sets ``residual`` [N].
+        """Returns the energy (B,) [J] and `balance` (B,) [N] at ``positions``.
+
+        Sets ``residual`` [N].
 
         The residual is the potential's gradient, zero at fixed vertices.
         """
         self.launch(self._evaluation)
         return self.energy.clone(), self.balance.clone()
 
-    def update_tangent(self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None) -> None:
+    def update_tangent(
+        self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None
+    ) -> None:
         """Computes dP/dF at ``positions``.
 
         Args:
@@ -241,8 +280,10 @@ class IncrementalPotential(Launcher):
             whole = self.low_rank.unflatten(1, (self.n_vertices, 3))
             self.low_rank = self.coordinates.restrict(whole).flatten(1, 2)
 
-    def pair_tangents(self, clamp: bool = False, active: torch.Tensor | None = None) -> list[PairTangents]:
-        """Returns the parts of the Hessian at ``positions`` that couple vertices of different cells.
+    def pair_tangents(
+        self, clamp: bool = False, active: torch.Tensor | None = None
+    ) -> list[PairTangents]:
+        """Returns parts of the Hessian at ``positions`` that couple vertices of different cells.
 
         Args:
             clamp: whether negative eigenvalues are left out.
@@ -254,11 +295,15 @@ class IncrementalPotential(Launcher):
 
     @property
     def feasible(self) -> torch.Tensor | None:
-        """Buffer (B, N, 3) of positions of finite energy [m], or None if all are (`Term.feasible`)."""
+        """Buffer (B, N, 3) of positions of finite energy [m],
+        or None if all are (`Term.feasible`).
+        """
         return self._feasible[0][0] if self._feasible else None
 
     def improved_start(self, start: torch.Tensor) -> torch.Tensor:
-        """Returns positions (B, N, 3) at which a solve starts instead of `start` (`Term.improve_start`), in planes."""
+        """Returns positions (B, N, 3) at which a solve starts instead of `start`
+        (`Term.improve_start`), in planes.
+        """
         positions = start.to(torch.float64, copy=True, memory_format=torch.contiguous_format)
         for term in self.energies:
             term.improve_start(warp_view(positions, wp.vec3d))
@@ -278,7 +323,8 @@ class IncrementalPotential(Launcher):
                 term.check_start(self.feasible, follows)
 
     def place_fixed(self, fixed: torch.Tensor, places: torch.Tensor, least: float) -> bool:
-        """Moves the fixed vertices of `feasible` to their places, or towards them as far as bodies let them.
+        """Moves the fixed vertices of `feasible` to their places,
+        or towards them as far as bodies let them.
 
         Args:
             fixed: (D,) fixed vertices.
@@ -304,9 +350,9 @@ class IncrementalPotential(Launcher):
             b = int(share.argmin())
             vertex = int(way[b].norm(dim=-1).argmax())
             raise InputError(
-                f"fixed vertices move through the gap between surfaces in a step, in environment {b} by up to "
-                f"{1e3 * float(way[b, vertex].norm()):.3g} mm, at vertex {vertex}: move them less in a step, or go "
-                "there by several equilibria, one after another."
+                "fixed vertices move through the gap between surfaces in a step, in environment "
+                f"{b} by up to {1e3 * float(way[b, vertex].norm()):.3g} mm, at vertex {vertex}: "
+                "move them less in a step, or go there by several equilibria, one after another."
             )
         arrived = bool((share == 1.0).all())
         if not arrived:
@@ -315,7 +361,9 @@ class IncrementalPotential(Launcher):
 
     def bounds(self, origin: Any, positions: Any, share: Any) -> list[Any]:
         """Returns launches that bound the way between two arrays of positions (`Term.bounds`)."""
-        return [launch for term in self.energies for launch in term.bounds(origin, positions, share)]
+        return [
+            launch for term in self.energies for launch in term.bounds(origin, positions, share)
+        ]
 
     @property
     def couples_cells(self) -> bool:
@@ -329,7 +377,9 @@ class IncrementalPotential(Launcher):
 
     @property
     def tangents(self) -> list[torch.Tensor]:
-        """Blocks of dP/dF (B, P, blocks, 3, 3) [J] for each of `sets` (``kernels``), from the last `update_tangent`."""
+        """Blocks of dP/dF (B, P, blocks, 3, 3) [J] for each of `sets` (``kernels``),
+        from the last `update_tangent`.
+        """
         return self._prepare_tangents()
 
     def _prepare_tangents(self) -> list[torch.Tensor]:
@@ -350,10 +400,18 @@ class IncrementalPotential(Launcher):
                 tangent = warp_view(next(blocks), wp.mat33d)
                 kernel, inputs, by_cells = term.tangent(s, self._position_view)
                 threads = s.cells if by_cells else s.n_points
-                tangents.append(self.record(kernel, (self.batch, threads), [*masks, *inputs], [tangent]))
+                tangents.append(
+                    self.record(kernel, (self.batch, threads), [*masks, *inputs], [tangent])
+                )
                 stress = s.stress_view(self.zeros(s.n_points, 3, s.width))
-                products += [self.product(s, tangent, direction, stress), self.gather(s, stress, self._product)]
-        self.tangent_launches, self._product_commands = self.capture(*tangents), self.capture(*products)
+                products += [
+                    self.product(s, tangent, direction, stress),
+                    self.gather(s, stress, self._product),
+                ]
+        self.tangent_launches, self._product_commands = (
+            self.capture(*tangents),
+            self.capture(*products),
+        )
 
     def stiffness_product(self, direction: torch.Tensor) -> torch.Tensor:
         """Returns the product (B, N, 3) of the stiffness with a displacement, at all vertices [N].
@@ -378,7 +436,8 @@ class IncrementalPotential(Launcher):
         return product
 
     def value_adjoint(self, adjoint: torch.Tensor) -> list[dict[str, torch.Tensor]]:
-        """Returns -z . d residual / d value, (B, *shape), at ``positions`` for the values of each term, by name.
+        """Returns -z . d residual / d value, (B, *shape),
+        at ``positions`` for the values of each term, by name.
 
         Args:
             adjoint: (B, N, 3) z [m].
@@ -390,4 +449,6 @@ class IncrementalPotential(Launcher):
     def prepare_adjoint(self) -> None:
         """Makes buffers and launches of `value_adjoint`, unless they exist."""
         if not self._adjoints:
-            self._adjoints = [term.adjoint(self.positions, self._direction) for term in self.energies]
+            self._adjoints = [
+                term.adjoint(self.positions, self._direction) for term in self.energies
+            ]

@@ -1,15 +1,17 @@
 """Follower pressure in closed chambers and on open faces.
 
-The operators g_a of a surface point hold the shape functions of its face and their two reference gradients, so that
-F = sum_a x_a g_a^T has the columns x, t1 and t2: position and tangents of the deformed face. The enclosed volume is the
-sum of -w/3 x . (t1 x t2) = -w/3 det F, as the faces are oriented into the chamber, and the potential of a gauge
-pressure p is -p V (Bonet and Wood 2008, section 8.5.2).
+The operators g_a of a surface point hold the shape functions of its face and their two reference
+gradients, so that F = sum_a x_a g_a^T has the columns x, t1 and t2: position and tangents of the
+deformed face. The enclosed volume is the sum of -w/3 x . (t1 x t2) = -w/3 det F, as the faces are
+oriented into the chamber, and the potential of a gauge pressure p is -p V (Bonet and Wood 2008,
+section 8.5.2).
 
-Over open faces, V is the volume of the cone from a constant apex c, with x - c in place of x. Its derivatives are the
-forces of the pressure, the sums of -w (t1 x t2) N_a, except at vertices of the open edges, where they differ by an
-integral along the edges. That part does no work where the edges are fixed, or slide in a symmetry plane through c, so
-that -p V is a potential there too. In the reactions of fixed vertices it is corrected (`BoundPressure.load_at_fixed`).
-Verified in tests/energies/test_open_faces.py.
+Over open faces, V is the volume of the cone from a constant apex c, with x - c in place of x. Its
+derivatives are the forces of the pressure, the sums of -w (t1 x t2) N_a, except at vertices of the
+open edges, where they differ by an integral along the edges. That part does no work where the edges
+are fixed, or slide in a symmetry plane through c, so that -p V is a potential there too. In the
+reactions of fixed vertices it is corrected (`BoundPressure.load_at_fixed`). Verified in
+tests/energies/test_open_faces.py.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,13 +34,19 @@ from .launcher import Launcher
 from .term import LawTerm, PartPoints, PointSet, Values, value_of
 
 PRESSURE = Quantity(
-    *("pressure", "Pa"), per="chamber", typical=1e4, words="pressure", shown_unit="kPa", shown_factor=1e-3
+    *("pressure", "Pa"),
+    per="chamber",
+    typical=1e4,
+    words="pressure",
+    shown_unit="kPa",
+    shown_factor=1e-3,
 )
 
 
 @dataclass(frozen=True)
 class Pressure(Energy):
-    """-p V of every chamber, closed or open, with the gauge pressures as the input ``pressure`` [Pa].
+    """-p V of every chamber, closed or open, with the gauge pressures
+    as the input ``pressure`` [Pa].
 
     The edges of open faces must be fixed or lie in symmetry planes.
 
@@ -55,7 +63,9 @@ class Pressure(Energy):
         """Checks that there is a chamber."""
         check_fields(self)
         if not self.chambers:
-            raise InputError("pressure acts in chambers, but there are none: find them with find_chambers.")
+            raise InputError(
+                "pressure acts in chambers, but there are none: find them with find_chambers."
+            )
 
     @property
     @override
@@ -80,23 +90,36 @@ class Pressure(Energy):
         nodes = np.concatenate([chamber.faces for chamber in self.chambers])
         operator = np.concatenate([values[..., None], gradients], axis=2)  # (Q, K, 3)
         operators = np.broadcast_to(operator, (len(nodes), *operator.shape)).copy()
-        part = np.repeat(np.arange(self.count), [len(chamber.faces) * len(weights) for chamber in self.chambers])
+        part = np.repeat(
+            np.arange(self.count), [len(chamber.faces) * len(weights) for chamber in self.chambers]
+        )
         return (PartPoints(nodes, operators, part, np.tile(weights / 3.0, len(nodes))),)
 
     def volumes(self, mesh: Mesh, positions: torch.Tensor) -> torch.Tensor:
-        """Returns the volumes (B, chambers) at positions (B, N, 3) of the vertices of a mesh, differentiable [m^3].
+        """Returns the volumes (B, chambers) at positions (B, N, 3)
+        of the vertices of a mesh, differentiable [m^3].
 
-        That of a closed chamber is what it encloses, that of open faces what they have swept on a straight way from
-        rest. The pressure does the work p dV: dV/dx is its force per pressure, while open edges stay where they were.
+        That of a closed chamber is what it encloses, that of open faces what they have swept on a
+        straight way from rest. The pressure does the work p dV: dV/dx is its force per pressure,
+        while open edges stay where they were.
         """
         (points,) = self.points(mesh)
-        operators, weights = (torch.as_tensor(x).to(positions) for x in (points.gradients, points.weights))
-        nodes, part = torch.as_tensor(points.nodes), torch.as_tensor(points.part).to(positions.device)
-        f = torch.einsum("cqkw,bcki->bcqiw", operators, positions[:, nodes]).flatten(1, 2)  # (B, P, 3, 3)
-        rest = torch.einsum("cqkw,cki->cqiw", operators, torch.as_tensor(mesh.vertices).to(f)[nodes]).flatten(0, 1)
-        is_open = torch.tensor([len(chamber.edges) > 0 for chamber in self.chambers], device=f.device)[part]
+        operators, weights = (
+            torch.as_tensor(x).to(positions) for x in (points.gradients, points.weights)
+        )
+        nodes = torch.as_tensor(points.nodes)
+        part = torch.as_tensor(points.part).to(positions.device)
+        # (B, P, 3, 3)
+        f = torch.einsum("cqkw,bcki->bcqiw", operators, positions[:, nodes]).flatten(1, 2)
+        rest = torch.einsum(
+            "cqkw,cki->cqiw", operators, torch.as_tensor(mesh.vertices).to(f)[nodes]
+        ).flatten(0, 1)
+        is_open = torch.tensor(
+            [len(chamber.edges) > 0 for chamber in self.chambers], device=f.device
+        )[part]
         ways = (f - rest)[..., 0]
-        areas = _normals(rest) + 4.0 * _normals(0.5 * (f + rest)) + _normals(f)  # Simpson's rule is exact
+        # Simpson's rule is exact
+        areas = _normals(rest) + 4.0 * _normals(0.5 * (f + rest)) + _normals(f)
         swept = 0.5 * (ways * areas).sum(-1)
         parts = -weights * torch.where(is_open, swept, torch.linalg.det(f))
         return parts.new_zeros(len(parts), self.count).index_add(1, part, parts)
@@ -125,17 +148,28 @@ class BoundPressure(BoundEnergy):
         device, (points,) = site.rest_positions.device, site.points
         assert isinstance(points, PartPoints)
         apexes = np.array([_apex(chamber, site.body) for chamber in energy.chambers])
-        edges = np.unique(np.concatenate([chamber.edges.ravel() for chamber in energy.chambers])) + site.first
+        edges = (
+            np.unique(np.concatenate([chamber.edges.ravel() for chamber in energy.chambers]))
+            + site.first
+        )
         at_edge = np.isin(points.nodes, edges)
         touching = at_edge.any(axis=1)
         shape = points.gradients.shape[:2]
         self._apex, self._operators, self._weights = (
             torch.as_tensor(values, device=device, dtype=torch.float64)
-            for values in (apexes, points.gradients[touching], points.weights.reshape(shape)[touching])
+            for values in (
+                apexes,
+                points.gradients[touching],
+                points.weights.reshape(shape)[touching],
+            )
         )
         self._nodes, self._part, self._at_edge = (
             torch.as_tensor(values, device=device)
-            for values in (points.nodes[touching], points.part.reshape(shape)[touching], at_edge[touching])
+            for values in (
+                points.nodes[touching],
+                points.part.reshape(shape)[touching],
+                at_edge[touching],
+            )
         )
 
     @override
@@ -144,18 +178,26 @@ class BoundPressure(BoundEnergy):
 
     @override
     def load_at_fixed(self, q: torch.Tensor, values: Values) -> torch.Tensor | None:
-        """Returns the force of the pressure at the vertices of open edges, less the derivative of p V [N].
+        """Returns the force of the pressure at the vertices of open edges,
+        less the derivative of p V [N].
 
-        A point of weight w (a third of the face's) has the force -3 w p a0 N_a and the derivative -w p cof F g_a, with
-        the columns a0 = t1 x t2, a1 = t2 x (x - c) and a2 = (x - c) x t1 of cof F.
+        A point of weight w (a third of the face's) has the force -3 w p a0 N_a and the derivative
+        -w p cof F g_a, with the columns a0 = t1 x t2, a1 = t2 x (x - c) and a2 = (x - c) x t1 of
+        cof F.
         """
         if not len(self._nodes):
             return None
         f = torch.einsum("cqkw,bcki->bcqiw", self._operators, q[:, self._nodes].double())
         x, t1, t2 = f[..., 0] - self._apex[self._part], f[..., 1], f[..., 2]
-        columns = 2.0 * torch.linalg.cross(t1, t2), torch.linalg.cross(x, t2), torch.linalg.cross(t1, x)
+        columns = (
+            2.0 * torch.linalg.cross(t1, t2),
+            torch.linalg.cross(x, t2),
+            torch.linalg.cross(t1, x),
+        )
         push = -self._weights * value_of(values, "pressure").double()[:, self._part]
-        forces = torch.einsum("bcqiw,cqkw->bcki", push[..., None, None] * torch.stack(columns, -1), self._operators)
+        forces = torch.einsum(
+            "bcqiw,cqkw->bcki", push[..., None, None] * torch.stack(columns, -1), self._operators
+        )
         forces = forces * self._at_edge[..., None]
         return torch.zeros_like(q).index_add(1, self._nodes.ravel(), forces.flatten(1, 2).to(q))
 
@@ -166,7 +208,8 @@ def _normals(f: torch.Tensor) -> torch.Tensor:
 
 
 def _apex(chamber: Chamber, body: Body) -> FloatArray:
-    """Returns the apex (3,) of the cone over open faces [m]: in the symmetry planes of their edges, or the origin.
+    """Returns the apex (3,) of the cone over open faces [m]:
+    in the symmetry planes of their edges, or the origin.
 
     Raises:
         MeshError: see `check_open_faces`; or two of the planes are parallel.
@@ -176,14 +219,21 @@ def _apex(chamber: Chamber, body: Body) -> FloatArray:
     sliding = [plane.contains(body.vertices[edges]).all(axis=1) for plane in body.symmetry]
     fixed = np.isin(edges, body.fixed_vertices).all(axis=1)
     check_open_faces(chamber, body.mesh, np.any([fixed, *sliding], axis=0))
-    planes = [plane for plane, inside in zip(body.symmetry, sliding, strict=True) if (inside & ~fixed).any()]
+    planes = [
+        plane
+        for plane, inside in zip(body.symmetry, sliding, strict=True)
+        if (inside & ~fixed).any()
+    ]
     if not planes:
         return np.zeros(3)
-    normals, offsets = np.array([plane.normal for plane in planes]), np.array([plane.offset for plane in planes])
+    normals = np.array([plane.normal for plane in planes])
+    offsets = np.array([plane.offset for plane in planes])
     apex = np.linalg.lstsq(normals, offsets, rcond=None)[0]
-    if not np.allclose(normals @ apex, offsets, rtol=0.0, atol=max(plane.tolerance for plane in planes)):
+    if not np.allclose(
+        normals @ apex, offsets, rtol=0.0, atol=max(plane.tolerance for plane in planes)
+    ):
         raise MeshError(
-            f"{chamber.name} has open edges in symmetry planes that have no common point: leave one of the planes out, "
-            "or fix the vertices of the edges there."
+            f"{chamber.name} has open edges in symmetry planes that have no common point: leave "
+            "one of the planes out, or fix the vertices of the edges there."
         )
     return np.asarray(apex)

@@ -1,13 +1,14 @@
 r"""Rigid parts as affine bodies, and inertia of dependent vertices.
 
-A rigid part, a region of the mesh, is controlled by four of its vertices r_c (`fem.coordinates`) and has a single
-deformation gradient F (Lan et al., Affine Body Dynamics, 2022). The energy kappa V |F - R(F)|^2 keeps F close to a
-rotation. The inertial energy of the part is
+A rigid part, a region of the mesh, is controlled by four of its vertices r_c (`fem.coordinates`)
+and has a single deformation gradient F (Lan et al., Affine Body Dynamics, 2022). The energy
+kappa V |F - R(F)|^2 keeps F close to a rotation. The inertial energy of the part is
 
-    1 / 2 integral rho |x - y|^2 dV = rho / 2 sum_p |sum_c L_cp (r_c - y_c)|^2,      L L^T = integral w w^T dV,
+    1 / 2 integral rho |x - y|^2 dV = rho / 2 sum_p |sum_c L_cp (r_c - y_c)|^2,
+    L L^T = integral w w^T dV,
 
-with the barycentric coordinates w: mass and inertia tensor of the cells are exact, and for a rotation F the motion is
-that of a rigid body.
+with the barycentric coordinates w: mass and inertia tensor of the cells are exact, and for a
+rotation F the motion is that of a rigid body.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,7 +52,10 @@ class _OnOwnPoints(Energy):
 
 @dataclass(frozen=True)
 class PointInertia(_OnOwnPoints):
-    """Inertia of points; values of a step are ``inertia`` (B, P) [N/m] and ``target`` (B, P, 3) [m]."""
+    """Inertia of points.
+
+    Values of a step are ``inertia`` (B, P) [N/m] and ``target`` (B, P, 3) [m].
+    """
 
     part_points: PartPoints  # a part each
 
@@ -113,7 +117,9 @@ class BoundRigidInertia(BoundInertia):
 
 @dataclass(frozen=True)
 class Rigidity(_OnOwnPoints):
-    """The energy kappa V |F - R(F)|^2 that keeps a part's deformation gradient close to a rotation."""
+    """The energy kappa V |F - R(F)|^2 that keeps a part's deformation gradient close to a
+    rotation.
+    """
 
     part_points: SolidPoints  # a single point with the volume of the part
     stiffness: float  # kappa [Pa]
@@ -131,8 +137,9 @@ class Rigidity(_OnOwnPoints):
 class RigidityTerm(SolidTerm):
     """Kernels of the rigidity of a part.
 
-    A solve begins where the deformation gradient of the part is a rotation: by inertia alone its vertices go straight
-    on, and the part grows, which the stiff energy takes many iterations to undo.
+    A solve begins where the deformation gradient of the part is a rotation: by inertia alone its
+    vertices go straight on, and the part grows, which the stiff energy takes many iterations to
+    undo.
     """
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], energy: Rigidity) -> None:
@@ -182,7 +189,9 @@ def rigid_energies(body: Body, name: str, part: Rigid) -> list[Energy]:
     w, volume = barycentric(corners, places), float(volumes.sum())
     moments = np.einsum("p,pa,pb->ab", volumes, w, w)
     carried = scipy.sparse.csr_array(np.array([[volume]]))
-    point = SolidPoints(controls[None], gradients[None, None], carried, scipy.sparse.csr_array((1, 1)))
+    point = SolidPoints(
+        controls[None], gradients[None, None], carried, scipy.sparse.csr_array((1, 1))
+    )
     operators = np.asarray(np.linalg.cholesky(moments).T[None, :, :, None], dtype=np.float64)
     inertia = RigidInertia(one_part_each(Points(controls[None], operators)), cells, part.density)
     return [Rigidity(point, part.stiffness, moments.sum(0) / volume), inertia]

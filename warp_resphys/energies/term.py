@@ -1,4 +1,6 @@
-"""Kernels of an energy for a batch: the values of a step that they read, and their launches at sets of points."""
+"""Kernels of an energy for a batch: the values of a step that they read,
+and their launches at sets of points.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -63,8 +65,15 @@ class PointSet:
         incident: cell K + local node, for every cell of a vertex.
     """
 
-    def __init__(self, launcher: Launcher, points: Points, n_vertices: int, in_body: slice, in_energy: slice) -> None:
-        self.source, self.in_body, self.in_energy, self.n_points = points, in_body, in_energy, points.n_points
+    def __init__(
+        self, launcher: Launcher, points: Points, n_vertices: int, in_body: slice, in_energy: slice
+    ) -> None:
+        self.source, self.in_body, self.in_energy, self.n_points = (
+            points,
+            in_body,
+            in_energy,
+            points.n_points,
+        )
         self.n_vertices, self.device = n_vertices, launcher.device
         self.cells, self.points_per_cell, self.nodes_per_cell, self.width = points.gradients.shape
         vertex = points.nodes.ravel()
@@ -76,7 +85,9 @@ class PointSet:
         shape = (-1, self.nodes_per_cell) if self.width == 1 else (-1, self.nodes_per_cell, 3)
         kind, scalar = (VectorPoints, wp.float64) if self.width == 1 else (MatrixPoints, wp.vec3d)
         operators = launcher.upload(points.gradients.reshape(shape), scalar)
-        self.points = struct_of(kind, nodes=nodes, operators=operators, per_cell=self.points_per_cell)
+        self.points = struct_of(
+            kind, nodes=nodes, operators=operators, per_cell=self.points_per_cell
+        )
         self.start = launcher.upload(start.astype(np.int32), int)
         self.incident = launcher.upload(order.astype(np.int32), int)
 
@@ -92,7 +103,9 @@ class PointSet:
 
     def stress_view(self, stress: torch.Tensor) -> Any:
         """Returns the Warp array of a stress (B, P, 3, width)."""
-        return warp_view(stress[..., 0], wp.vec3d) if self.width == 1 else warp_view(stress, wp.mat33d)
+        return (
+            warp_view(stress[..., 0], wp.vec3d) if self.width == 1 else warp_view(stress, wp.mat33d)
+        )
 
 
 class Kernel(NamedTuple):
@@ -101,8 +114,8 @@ class Kernel(NamedTuple):
     Attributes:
         kernel: for (B, P) points, or (B, C) cells.
         inputs: after ``active``, and for a tangent after ``clamp`` too.
-        by_cells: whether there is one thread per cell. Then ``step`` adds forces to a residual (B, N) directly, so that
-            there is no stress of the points.
+        by_cells: whether there is one thread per cell. Then ``step`` adds forces to a residual
+            (B, N) directly, so that there is no stress of the points.
     """
 
     kernel: Any
@@ -121,8 +134,8 @@ class Slope(NamedTuple):
 class Term(ABC):
     """An energy's kernels for a batch.
 
-    Subclasses have the module of kernels ``_kernels``, with ``local_step``, ``tangent`` and ``adjoint``, and what these
-    take: `_arguments` and `_slopes`.
+    Subclasses have the module of kernels ``_kernels``, with ``local_step``, ``tangent`` and
+    ``adjoint``, and what these take: `_arguments` and `_slopes`.
 
     Args:
         launcher: launcher of the potential.
@@ -150,7 +163,7 @@ class Term(ABC):
 
     @abstractmethod
     def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
-        """Returns the inputs that the kernels ``local_step``, ``tangent`` and ``adjoint`` have in common."""
+        """Inputs that the kernels ``local_step``, ``tangent`` and ``adjoint`` have in common."""
 
     def step(self, s: PointSet, positions: Any) -> Kernel:
         """Returns the kernel of stress and energy."""
@@ -162,10 +175,13 @@ class Term(ABC):
 
     @abstractmethod
     def curvature(self) -> torch.Tensor:
-        """Returns an upper bound (1 or B, P) of the tangent's eigenvalues at small strains, times the volume [J]."""
+        """Returns an upper bound (1 or B, P) of the tangent's eigenvalues
+        at small strains, times the volume [J].
+        """
 
     def adjoint(self, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
-        """Returns a function that computes -z . d residual / d value at positions x, by name, from the buffers.
+        """Returns a function that computes -z . d residual / d value at positions x,
+        by name, from the buffers.
 
         Args:
             positions: (B, N, 3) buffer of x [m].
@@ -177,7 +193,9 @@ class Term(ABC):
         for s in self.sets:
             views = [warp_view(out[o.name].narrow(1, s.first, s.n_points), o.kind) for o in outputs]
             inputs = self._adjoint_inputs(s, x, z)
-            commands.append(batch.record(self._kernels.adjoint, (batch.batch, s.n_points), inputs, views))
+            commands.append(
+                batch.record(self._kernels.adjoint, (batch.batch, s.n_points), inputs, views)
+            )
 
         def differentiate() -> dict[str, torch.Tensor]:
             batch.launch(*commands)
@@ -194,25 +212,36 @@ class Term(ABC):
         return [*self._arguments(s, positions), direction]
 
     def _by_values(self, out: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Returns the derivatives by the values from those at the points, summed where these share a value."""
+        """Returns derivatives by values from those at points, summed where these share a value."""
         sums = ((name, slope, self.values[name].shape) for name, slope in out.items())
-        return {name: slope.clone() if slope.shape == shape else slope.sum(1) for name, slope, shape in sums}
+        return {
+            name: slope.clone() if slope.shape == shape else slope.sum(1)
+            for name, slope, shape in sums
+        }
 
     def total_stiffness(self) -> torch.Tensor | None:
-        """Returns the sum (B,) of a solid's moduli times volumes, the scale of its energy's rounding error [J]."""
+        """Returns the sum (B,) of a solid's moduli times volumes,
+        the scale of its energy's rounding error [J].
+        """
         return None
 
     def before(self, positions: Any, active: Any) -> list[Any]:
-        """Returns launches to be made before the kernels of `step` and `tangent`, at the same positions."""
+        """Returns launches to be made before the kernels of `step` and `tangent`,
+        at the same positions.
+        """
         del positions, active
         return []
 
     def low_rank(self, positions: Any) -> torch.Tensor | None:
-        """Returns columns C (B, 3 N, r) of the part C C^T of the Hessian that couples many cells, or None."""
+        """Returns columns C (B, 3 N, r) of the part C C^T of the Hessian
+        that couples many cells, or None.
+        """
         del positions
         return None
 
-    def pair_tangents(self, positions: Any, clamp: bool, active: torch.Tensor) -> PairTangents | None:
+    def pair_tangents(
+        self, positions: Any, clamp: bool, active: torch.Tensor
+    ) -> PairTangents | None:
         """Returns the part of the Hessian that couples vertices of different cells, or None.
 
         Args:
@@ -228,20 +257,24 @@ class Term(ABC):
         return None
 
     def improve_start(self, positions: Any) -> None:
-        """Changes positions (B, N) at which a solve may start, a Warp array, so that it takes fewer iterations."""
+        """Changes positions (B, N) at which a solve may start,
+        a Warp array, so that it takes fewer iterations.
+        """
         del positions
 
     def check_start(self, start: torch.Tensor, follows: bool) -> None:
         """Raises InputError where a solve cannot start at positions.
 
         Args:
-            start: (B, N, 3) `feasible` positions of all terms, fixed vertices where they were before [m].
+            start: (B, N, 3) `feasible` positions of all terms, fixed vertices where they were
+                before [m].
             follows: whether the step begins where the last one ended.
         """
         del start, follows
 
     def free_way(self, origin: torch.Tensor, end: torch.Tensor, share: torch.Tensor) -> None:
-        """Lowers the share (B,) of the way of fixed vertices, between positions (B, N, 3) [m], that others leave free.
+        """Lowers the share (B,) of the way of fixed vertices,
+        between positions (B, N, 3) [m], that others leave free.
 
         Up to that share, no barrier is passed, although no other vertex moves.
         """
@@ -256,7 +289,8 @@ class Term(ABC):
         return None
 
     def bounds(self, origin: Any, positions: Any, share: Any) -> list[Any]:
-        """Returns launches that lower the share (B) of the way from one array of positions (B, N) to another.
+        """Returns launches that lower the share (B) of the way
+        from one array of positions (B, N) to another.
 
         Up to that share, which depends on no other term and no order, no barrier is passed.
         """
@@ -269,7 +303,7 @@ class PartPoints(Points):
     """Weighted points that belong to the parts of an energy, such as chambers or tendons."""
 
     part: NDArray[np.int64]  # (P,) index of the part
-    weights: NDArray[np.float64]  # (P,) weight of the point's energy: a volume, an area, a length, or one
+    weights: NDArray[np.float64]  # (P,) of the point's energy: a volume, area, length, or one
 
 
 class PartTerm(Term):
@@ -281,7 +315,9 @@ class PartTerm(Term):
         part, part_of: (P,) part of each point, likewise.
     """
 
-    def __init__(self, launcher: Launcher, sets: Sequence[PointSet], shapes: Shapes, count: int) -> None:
+    def __init__(
+        self, launcher: Launcher, sets: Sequence[PointSet], shapes: Shapes, count: int
+    ) -> None:
         super().__init__(launcher, sets, shapes)
         (s,) = sets
         assert isinstance(s.source, PartPoints)
@@ -304,12 +340,14 @@ class LawTerm(PartTerm):
         launcher: launcher of the potential.
         sets: one set of points.
         law: energy of a point as a function of the values.
-        shapes: shapes of the values in the order of the vector: (count,) or (count, n) for one or n values per part.
+        shapes: shapes of the values in the order of the vector: (count,) or (count, n) for one or n
+            values per part.
         count: number of parts.
         arrays: names of arrays, of any shape, that every point reads completely.
         constants: numbers that are the last values at every point.
-        stiffness: returns an upper bound (B, count) of the eigenvalues of a point of weight one from the values; zero
-            if omitted: the constant matrix of projective dynamics does not contain the energy.
+        stiffness: returns an upper bound (B, count) of the eigenvalues of a point of weight one
+            from the values; zero if omitted: the constant matrix of projective dynamics does not
+            contain the energy.
     """
 
     def __init__(
@@ -335,7 +373,9 @@ class LawTerm(PartTerm):
         of_constants = np.tile(np.arange(len(constants))[:, None], len(part))
         columns = np.concatenate([*self._columns.values(), of_constants])
         self._column = launcher.upload(columns.astype(np.int32), int)
-        sizes = [int(np.prod(shape)) for name, shape in self._shapes.items() for _ in self._columns[name]]
+        sizes = [
+            int(np.prod(shape)) for name, shape in self._shapes.items() for _ in self._columns[name]
+        ]
         sizes += [len(constants)] * len(constants)
         self._sizes = launcher.upload(np.array(sizes, dtype=np.int32), int)
 
@@ -348,7 +388,9 @@ class LawTerm(PartTerm):
 
     @override
     def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
-        pointers = [self.values[name].data_ptr() for name in self._shapes for _ in self._columns[name]]
+        pointers = [
+            self.values[name].data_ptr() for name in self._shapes for _ in self._columns[name]
+        ]
         pointers += [self._constants.data_ptr()] * self._constants.shape[1]
         addresses = self.launcher.upload(np.array(pointers, dtype=np.uint64), wp.uint64)
         where = {"addresses": addresses, "sizes": self._sizes, "places": self._column}

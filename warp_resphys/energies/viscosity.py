@@ -1,15 +1,18 @@
-r"""Viscosity of a solid over one implicit stage: Kelvin-Voigt, and generalised Maxwell (Prony) branches.
+r"""Viscosity of a solid over one implicit stage: Kelvin-Voigt,
+and generalised Maxwell (Prony) branches.
 
-Both are quadratic in the Green strain E(x) of the stage's solution, so that a step still minimises one potential, with
-the additional density
+Both are quadratic in the Green strain E(x) of the stage's solution, so that a step still minimises
+one potential, with the additional density
 
     mu (c E - 2 W) : E + lambda / 2 (d tr E - 2 w) tr E .
 
-Kelvin-Voigt viscosity of retardation times beta and beta_b of shear and bulk, mostly equal, has c = beta / h_e,
-d = beta_b / h_e, W = c R with the reference strain R of the integrator's stage, and w = d tr R.
+Kelvin-Voigt viscosity of retardation times beta and beta_b of shear and bulk, mostly equal, has
+c = beta / h_e, d = beta_b / h_e, W = c R with the reference strain R of the integrator's stage, and
+w = d tr R.
 
-Prony branches relax shear only: G(t) = mu (1 + sum_k g_k exp(-t / tau_k)), with the long-term modulus mu; lambda stays
-elastic, as is usual for rubber. Branch k has the strain H_k that has not relaxed yet:
+Prony branches relax shear only: G(t) = mu (1 + sum_k g_k exp(-t / tau_k)), with the long-term
+modulus mu; lambda stays elastic, as is usual for rubber. Branch k has the strain H_k that has not
+relaxed yet:
 
     dH/dt = dE/dt - H / tau,     second Piola-Kirchhoff stress  2 mu g H .
 
@@ -17,8 +20,9 @@ For a constant strain rate during s seconds the exact, unconditionally stable so
 
     H(s) = exp(-s / tau) H(0) + gamma (E(s) - E(0)),     gamma = (1 - exp(-s / tau)) tau / s
 
-(Taylor, Pister and Goudreau 1970; Simo and Hughes, Computational Inelasticity, 1998, section 10.3). So a branch adds
-g gamma to c, and g (gamma E(0) - exp(-s / tau) H(0)) to W; the cost of a step does not depend on their number.
+(Taylor, Pister and Goudreau 1970; Simo and Hughes, Computational Inelasticity, 1998, section 10.3).
+So a branch adds g gamma to c, and g (gamma E(0) - exp(-s / tau) H(0)) to W; the cost of a step does
+not depend on their number.
 """
 
 from collections.abc import Callable
@@ -36,7 +40,8 @@ from ..stepping.state import ImplicitStage
 from .launcher import warp_view
 from .term import Term
 
-Strain = Callable[[torch.Tensor], torch.Tensor]  # (B, N, 3) positions to the Green strain (B, P, 3, 3)
+# (B, N, 3) positions to the Green strain (B, P, 3, 3)
+Strain = Callable[[torch.Tensor], torch.Tensor]
 StepValues = tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]
 _KEPT = 3  # strains
 
@@ -47,13 +52,19 @@ class Viscosity:
 
     damping: torch.Tensor  # (1 or B, 2) retardation times beta of shear and bulk [s]
     damped: bool  # whether these may be non-zero
-    ratio: torch.Tensor | None  # (1 or B, K) moduli of the Prony branches over mu; None without branches
+    ratio: torch.Tensor | None  # (1 or B, K) moduli of the Prony branches over mu, if any
     time: torch.Tensor | None  # (1 or B, K) their relaxation times [s]
 
     def step_values(
-        self, strain: Strain, q: torch.Tensor, carried: torch.Tensor | None, stage: ImplicitStage, time_step: float
+        self,
+        strain: Strain,
+        q: torch.Tensor,
+        carried: torch.Tensor | None,
+        stage: ImplicitStage,
+        time_step: float,
     ) -> StepValues:
-        """Returns c and d (B, 2), W (B, P, 3, 3) and w (B, P) of a step, the last two None without viscosity.
+        """Returns c and d (B, 2), W (B, P, 3, 3) and w (B, P) of a step,
+        the last two None without viscosity.
 
         Args:
             strain: strain function of the solid.
@@ -78,13 +89,20 @@ class Viscosity:
         offset = factors * strained if offset is None else torch.addcmul(offset, factors, strained)
         if carried is not None:
             shares = (self.ratio * decay).expand(batch, -1)[:, None].to(offset)  # (B, 1, K)
-            flat = torch.baddbmm(offset.flatten(1)[:, None], shares, carried.flatten(2).to(offset), alpha=-1.0)
+            flat = torch.baddbmm(
+                offset.flatten(1)[:, None], shares, carried.flatten(2).to(offset), alpha=-1.0
+            )
             offset = flat.view_as(offset)
         dilation = offset.new_zeros(offset.shape[:2]) if dilation is None else dilation
         return torch.stack([both[:, 0] + added, both[:, 1]], 1), offset, dilation
 
     def relax(
-        self, strain: Strain, q: torch.Tensor, carried: torch.Tensor | None, end: torch.Tensor, seconds: float
+        self,
+        strain: Strain,
+        q: torch.Tensor,
+        carried: torch.Tensor | None,
+        end: torch.Tensor,
+        seconds: float,
     ) -> torch.Tensor:
         """Returns the strains H (B, K, P, 3, 3) of the branches at the end of a motion.
 
@@ -98,7 +116,9 @@ class Viscosity:
         assert self.time is not None
         decay, gamma = (x[..., None, None, None] for x in relaxation(self.time, seconds))
         strained = (strain(end) - strain(q))[:, None].to(gamma.dtype)
-        return gamma * strained if carried is None else torch.addcmul(decay * carried, gamma, strained)
+        return (
+            gamma * strained if carried is None else torch.addcmul(decay * carried, gamma, strained)
+        )
 
 
 def relaxation(time: torch.Tensor, seconds: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -112,10 +132,12 @@ class StrainTerm(Term):
 
     @cached_property
     def strain(self) -> Strain:
-        """Returns the Green strain (B, P, 3, 3) at positions (B, N, 3), by launches recorded at its first use.
+        """Returns the Green strain (B, P, 3, 3) at positions (B, N, 3),
+        by launches recorded at its first use.
 
-        On a CPU, the last results serve again, and must not be changed in place: with branches of Prony, a step needs
-        the strain at its end, where the next one begins, and BDF2 looks back by two steps.
+        On a CPU, the last results serve again, and must not be changed in place: with branches of
+        Prony, a step needs the strain at its end, where the next one begins, and BDF2 looks back by
+        two steps.
         """
         launcher = self.launcher
         at, out = launcher.zeros(self.sets[0].n_vertices, 3), launcher.zeros(self.n_points, 3, 3)
@@ -135,7 +157,8 @@ class StrainTerm(Term):
 
         def strain(positions: torch.Tensor) -> torch.Tensor:
             at.copy_(positions)
-            # A comparison waits for a GPU, and tensors of inference mode would have no gradient later.
+            # A comparison waits for a GPU, and tensors of inference mode would have no gradient
+            # later.
             keeps = at.device.type == "cpu" and not torch.is_inference_mode_enabled()
             for number, (place, strains) in enumerate(known if keeps else ()):
                 if torch.equal(place, at):
@@ -151,15 +174,24 @@ class StrainTerm(Term):
 
     @cached_property
     def strain_adjoint(self) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
-        """Returns the vector-Jacobian product (B, N, 3) of `strain` at positions with (B, P, 3, 3)."""
+        """Returns the vector-Jacobian product (B, N, 3) of `strain`
+        at positions with (B, P, 3, 3).
+        """
         launcher = self.launcher
-        at, out = launcher.zeros(self.sets[0].n_vertices, 3), launcher.zeros(self.sets[0].n_vertices, 3)
+        at = launcher.zeros(self.sets[0].n_vertices, 3)
+        out = launcher.zeros(self.sets[0].n_vertices, 3)
         along, stress = launcher.zeros(self.n_points, 3, 3), launcher.zeros(self.n_points, 3, 3)
         place, commands = warp_view(at, wp.vec3d), []
         for s in self.sets:
-            direction, view = (warp_view(values[:, s.in_energy], wp.mat33d) for values in (along, stress))
+            direction, view = (
+                warp_view(values[:, s.in_energy], wp.mat33d) for values in (along, stress)
+            )
             inputs = [s.points, place, direction]
-            commands.append(launcher.record(kernels.strain_adjoint, (launcher.batch, s.n_points), inputs, [view]))
+            commands.append(
+                launcher.record(
+                    kernels.strain_adjoint, (launcher.batch, s.n_points), inputs, [view]
+                )
+            )
             commands.append(launcher.gather(s, view, out))
         recorded = launcher.capture(*commands)
 

@@ -1,1 +1,3 @@
-"""Gymnasium environments on corrected simulators, to learn policies and to test them on the simulated laboratory."""
+"""Gymnasium environments on corrected simulators, to learn policies
+and to test them on the simulated laboratory.
+"""

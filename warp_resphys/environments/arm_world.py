@@ -1,4 +1,6 @@
-"""The world of arms of six joints, each of which carries a gripper of two soft fingers, and a ball on a table."""
+"""The world of arms of six joints, each of which carries a gripper of two soft fingers,
+and a ball on a table.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +36,8 @@ _STEP: Final = 0.0025  # largest time step of the arm [s]
 class ArmWorld(World[MountedState]):
     """B arms, which take the command of both fingers, and the angles of their joints [rad].
 
-    The last two markers are the place between the fingers that holds a ball, and the middle of the ball.
+    The last two markers are the place between the fingers that holds a ball, and the middle of the
+    ball.
 
     Args:
         robot: a finger, loaded with ``on_failure="count"``; the mount steps it by implicit Euler.
@@ -82,7 +85,9 @@ class ArmWorld(World[MountedState]):
 
     @override
     def markers(self, state: MountedState) -> FloatArray:
-        fingers = torch.cat(list(self._scene.observe(state.robot).values()), 1).double().cpu().numpy()
+        fingers = (
+            torch.cat(list(self._scene.observe(state.robot).values()), 1).double().cpu().numpy()
+        )
         held = state.pose[:, :3] + Rotation.from_rotvec(state.pose[:, 3:]).apply(self.held)
         ball = state.robot.q[:, self.ball].mean(1).double().cpu().numpy()
         return np.concatenate([fingers, held[:, None], ball[:, None]], axis=1)

@@ -29,27 +29,43 @@ FINGERS: Final = {"left": 0.0, "right": np.pi}  # angles about z [rad]
 BALL: Final = "ball"
 _GRIPPER: Final = "gripper"  # owner of the memory variable of the height
 _RADIUS, _MASS, _YOUNGS_MODULUS = 0.01, 0.01, 1e7  # of the ball [m, kg, Pa]
-_GAP, _BELOW = 1.5e-3, 1.5e-3  # between fingers and ball at rest, and from the fingers down to the table [m]
-_STIFFNESS, _FRICTION, _DISTANCE, _SLIP_SPEED = 5e4, 0.8, 5e-4, 5e-3  # of all contact [Pa, 1, m, m/s]
+# Between fingers and ball at rest, and from the fingers down to the table [m].
+_GAP, _BELOW = 1.5e-3, 1.5e-3
+# Of all contact [Pa, 1, m, m/s].
+_STIFFNESS, _FRICTION, _DISTANCE, _SLIP_SPEED = 5e4, 0.8, 5e-4, 5e-3
 _TOLERANCE: Final = 1e-6  # of the solver, relative
 
 
 def gripper(robot: Robot, divisions: int = 2) -> RobotScene:
-    """Returns two copies of a finger, which bends towards x and hangs along -z, on both sides of a rigid ball.
+    """Returns two copies of a finger, which bends towards x and hangs along -z,
+    on both sides of a rigid ball.
 
     Args:
         robot: the finger.
         divisions: of the ball; with an odd number it stands on a face, and does not roll.
     """
     mesh = robot.simulator.body.mesh
-    at, table = _RADIUS + _GAP + float(mesh.vertices[:, 0].max()), float(mesh.vertices[:, 2].min()) - _BELOW
-    robots = {name: (robot, (-at * np.cos(angle), 0, 0, 0, 0, angle)) for name, angle in FINGERS.items()}
+    at = _RADIUS + _GAP + float(mesh.vertices[:, 0].max())
+    table = float(mesh.vertices[:, 2].min()) - _BELOW
+    robots = {
+        name: (robot, (-at * np.cos(angle), 0, 0, 0, 0, angle)) for name, angle in FINGERS.items()
+    }
     ball = ball_mesh(_RADIUS, divisions, mesh.cells.shape[1])
     lift = table + 0.9 * _DISTANCE - float(ball.vertices[:, 2].min())
     ball = replace(ball, vertices=ball.vertices + [0.0, 0.0, lift])
-    below = Contact({"table": HalfSpace(position=(0.0, 0.0, table))}, _STIFFNESS, _FRICTION, _DISTANCE, _SLIP_SPEED)
+    below = Contact(
+        {"table": HalfSpace(position=(0.0, 0.0, table))},
+        _STIFFNESS,
+        _FRICTION,
+        _DISTANCE,
+        _SLIP_SPEED,
+    )
     density = _MASS / float(Body(ball).discretisation.element_volumes.sum())
-    things = {BALL: Body.rigid_body(ball, Rigid(density=density, stiffness=_YOUNGS_MODULUS), energies=[below])}
+    things = {
+        BALL: Body.rigid_body(
+            ball, Rigid(density=density, stiffness=_YOUNGS_MODULUS), energies=[below]
+        )
+    }
     contact = SurfaceContact(_STIFFNESS, _FRICTION, _DISTANCE, _SLIP_SPEED)
     return RobotScene(robots, things, contact, _TOLERANCE)
 
@@ -63,15 +79,19 @@ def ball_mesh(radius: float, divisions: int, nodes: int = 8) -> Mesh:
 
 
 def finger_forces(scene: RobotScene, state: State) -> FloatArray:
-    """Returns the forces (B, 2, 3) that hold the fingers at their bases, over the weight of the ball."""
-    return np.stack([total_force(scene.simulator, state, name) for name in FINGERS], axis=1) / (G * _MASS)
+    """Returns the forces (B, 2, 3) that hold the fingers at their bases,
+    over the weight of the ball.
+    """
+    return np.stack([total_force(scene.simulator, state, name) for name in FINGERS], axis=1) / (
+        G * _MASS
+    )
 
 
 def squeeze_of(scene: RobotScene, state: State) -> FloatArray:
     """Returns the force (B,) of the fingers beyond the least that holds the ball, over its weight.
 
-    In equilibrium a finger presses with what holds its base along the line between both bases. The least is half the
-    weight over the coefficient of friction.
+    In equilibrium a finger presses with what holds its base along the line between both bases. The
+    least is half the weight over the coefficient of friction.
     """
     fixed = (scene.simulator.body.fixed_in(name) for name in FINGERS)
     left, right = (state.q[:, at].mean(1).double().cpu().numpy() for at in fixed)
@@ -107,9 +127,12 @@ class GraspWorld(World[State]):
     @torch.no_grad()
     def step(self, state: State, commands: FloatArray) -> State:
         height = torch.as_tensor(commands[:, 1]).to(state.q)
-        poses = state.q.new_zeros(self._substeps, self.count, 6)  # of the base, alike in the frames of both fingers
+        # Of the base, alike in the frames of both fingers.
+        poses = state.q.new_zeros(self._substeps, self.count, 6)
         for part, pose in enumerate(poses, 1):
-            pose[:, 2] = torch.lerp(state.memory_of(_GRIPPER)["height"], height, part / self._substeps)
+            pose[:, 2] = torch.lerp(
+                state.memory_of(_GRIPPER)["height"], height, part / self._substeps
+            )
 
         def step(before: State, pose: torch.Tensor) -> State:
             inputs: dict[str, Given] = {self.input: commands[:, :1], BASE: pose}

@@ -12,7 +12,14 @@ from typing_extensions import override
 from ..control.plan import tracked_of
 from ..control.reduction import reduced_of
 from ..control.sampling import driven_input, settle_some
-from ..control.worlds import Laboratory, ReducedWorld, RobotWorld, World, laboratory_robot, laboratory_settings
+from ..control.worlds import (
+    Laboratory,
+    ReducedWorld,
+    RobotWorld,
+    World,
+    laboratory_robot,
+    laboratory_settings,
+)
 from ..experiment.build import choose_device
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
@@ -57,30 +64,36 @@ def make_vector(
     """Makes a vector environment of robots of a run, of a file, or of Python, with a task.
 
     Args:
-        task: ``reach``, ``follow``, ``swing_up``, which moves the base, ``grasp``, by two fingers (`GraspWorld`), or
-            ``pick_and_place``, by two fingers on an arm (`ArmWorld`).
-        run: the run folder, a file of `Robot.save`, or a robot, which needs ranges of its input if it is of `Robot.of`.
+        task: ``reach``, ``follow``, ``swing_up``, which moves the base, ``grasp``, by two fingers
+            (`GraspWorld`), or ``pick_and_place``, by two fingers on an arm (`ArmWorld`).
+        run: the run folder, a file of `Robot.save`, or a robot, which needs ranges of its input if
+            it is of `Robot.of`.
         num_envs: B.
         model: of the run; ``resphys`` if omitted.
-        world: ``simulator``; ``reduced``, the reduced model, which is fast and has fixed parameters (computing it takes
-            minutes if the run has none); or ``laboratory``, the simulation that stands in for the real robot.
-        spread: variation of the parameters between robots, in standard deviations of their identification.
+        world: ``simulator``; ``reduced``, the reduced model, which is fast and has fixed parameters
+            (computing it takes minutes if the run has none); or ``laboratory``, the simulation that
+            stands in for the real robot.
+        spread: variation of the parameters between robots, in standard deviations of their
+            identification.
         seconds: duration of an episode; 2 s if omitted, or 5 s for ``pick_and_place``.
         action_time: duration of an action [s], a multiple of the time step.
-        noise: standard deviation of the observed markers' coordinates [m]; a laboratory has its own.
+        noise: standard deviation of the observed markers' coordinates [m]; a laboratory has its
+            own.
         tracked: the markers whose mean is the point of the task; those of the tip if omitted.
         axis: along which a base moves.
         render_mode: ``rgb_array`` for pictures as arrays, or None.
         autoreset_mode: as in Gymnasium.
         device: of the simulation.
         seed: of the sampled inputs whose equilibria are the reachable places.
-        reach: ``task.reach`` of another environment, so that both have the same goals and the same units; sampled from
-            this robot if omitted.
+        reach: ``task.reach`` of another environment, so that both have the same goals and the same
+            units; sampled from this robot if omitted.
         forces: whether the force that holds each robot or finger at its base is observed.
-        squeeze: penalty on the force of fingers beyond the least that holds the ball, over its weight.
+        squeeze: penalty on the force of fingers beyond the least that holds the ball, over its
+            weight.
 
     Raises:
-        InputError: an unknown task or world, or a robot without the input or the forces that the task needs.
+        InputError: an unknown task or world, or a robot without the input or the forces that the
+            task needs.
         DataFileError: the run is missing, unfinished or changed.
     """
     robot, frames = _loaded(task, run, model, world, device, action_time)
@@ -90,8 +103,13 @@ def make_vector(
     shown = None if robot.labels else _spread_vertices(robot)
     bodies, mapping = _bodies(task, robot, num_envs, world, spread, axis, shown, seed, frames)
     rest = bodies.markers(bodies.rest)[0]
-    last = {"grasp": 3, "pick_and_place": 6}.get(task)  # coordinates of the task among those of the markers
-    point = _tip(robot, rest, tracked, shown) if last is None else np.eye(last, rest.size, rest.size - last)
+    # Coordinates of the task among those of the markers.
+    last = {"grasp": 3, "pick_and_place": 6}.get(task)
+    point = (
+        _tip(robot, rest, tracked, shown)
+        if last is None
+        else np.eye(last, rest.size, rest.size - last)
+    )
     goals: RobotTask
     if arms:
         goals = PlaceTask(num_envs, rest[-1])
@@ -100,27 +118,43 @@ def make_vector(
     else:
         reach = _reach(robot, mapping, point, shown, seed) if reach is None else reach
         follows = task == "follow"
-        goals = FollowTask(num_envs, actions, reach, action_time) if follows else ReachTask(num_envs, actions, reach)
+        goals = (
+            FollowTask(num_envs, actions, reach, action_time)
+            if follows
+            else ReachTask(num_envs, actions, reach)
+        )
     options = (noise, autoreset_mode, render_mode, up, forces, squeeze)
     return RobotVectorEnv(bodies, goals, mapping, point, actions, *options)
 
 
 def _lift(robot: Robot, count: int, up: FloatArray, place: FloatArray, grasps: bool) -> SwingTask:
-    """The task to lift a point (3,) from where it rests [m]: a ball, or the tip by the length of the body."""
-    return SwingTask(count, up, place, RISE if grasps else float(np.linalg.norm(place - _fixed(robot))))
+    """The task to lift a point (3,) from where it rests [m]:
+    a ball, or the tip by the length of the body.
+    """
+    return SwingTask(
+        count, up, place, RISE if grasps else float(np.linalg.norm(place - _fixed(robot)))
+    )
 
 
 def _loaded(
-    task: str, run: str | Path | Robot, model: str | None, world: str, device: str, action_time: float
+    task: str,
+    run: str | Path | Robot,
+    model: str | None,
+    world: str,
+    device: str,
+    action_time: float,
 ) -> tuple[Robot, int]:
-    """Returns the robot of a run, which must suit the task, and the number of steps of an action."""
+    """The robot of a run, which must suit the task, and the number of steps of an action."""
     if task not in TASKS:
         raise InputError(f"the task is {task!r}: choose {', '.join(TASKS)}.")
     if world not in WORLDS:
         raise InputError(f"the world is {world!r}: choose {', '.join(WORLDS)}.")
     if isinstance(run, Robot):
         if model not in (None, run.description.model):
-            raise InputError(f"the model is {model!r}, but the robot is {run.description.model!r}: leave model out.")
+            raise InputError(
+                f"the model is {model!r}, but the robot is {run.description.model!r}: leave "
+                "model out."
+            )
         robot = Robot(run.description, choose_device(device), "count", run.parameters, run.folder)
     else:
         robot = load(run, model, device, "count")
@@ -129,10 +163,13 @@ def _loaded(
     frames = round(action_time / robot.time_step)
     if frames < 1 or abs(frames * robot.time_step - action_time) > 1e-9:
         raise InputError(
-            f"action_time is {action_time:g} s: it must be a multiple of the step of {robot.time_step:g} s."
+            f"action_time is {action_time:g} s: it must be a multiple of the step of "
+            f"{robot.time_step:g} s."
         )
     if task == "swing_up" and (BASE not in robot.inputs or world != "simulator"):
-        raise InputError("swing_up moves the base of a simulated robot: choose a robot with fixed vertices.")
+        raise InputError(
+            "swing_up moves the base of a simulated robot: choose a robot with fixed vertices."
+        )
     return robot, frames
 
 
@@ -147,7 +184,9 @@ def _bodies(
     seed: int,
     frames: int,
 ) -> tuple[World[Any], ActionMapping]:
-    """Robots driven as in the trials of their run, by their base along an axis, or as grippers; and the map to inputs.
+    """Robots driven as in the trials of their run, by their base along an axis, or as grippers.
+
+    And the map to inputs.
 
     Worlds begin without inputs.
     """
@@ -155,7 +194,9 @@ def _bodies(
     if task in ("grasp", "pick_and_place"):
         return _grippers(task, robot, count, world, frames)
     if task == "swing_up":
-        along = np.concatenate([np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis), np.zeros(3)])[None]
+        along = np.concatenate(
+            [np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis), np.zeros(3)]
+        )[None]
         bodies = RobotWorld(robot, BASE, count, spread, along, shown)
         most = np.full(1, _BASE)
         return bodies, ActionMapping(-most, most, np.full(1, _BASE_SPEED), np.zeros(1), frames)
@@ -172,11 +213,18 @@ def _bodies(
     return bodies, ActionMapping(low, high, (high - low) / _RISE, np.zeros(len(low)), frames)
 
 
-def _grippers(task: str, robot: Robot, count: int, world: str, frames: int) -> tuple[World[Any], ActionMapping]:
-    """Grippers of two fingers each, and the map from actions to their input and height, or the angles of their arms."""
+def _grippers(
+    task: str, robot: Robot, count: int, world: str, frames: int
+) -> tuple[World[Any], ActionMapping]:
+    """Grippers of two fingers each, and the map from actions to their input and height,
+    or the angles of their arms.
+    """
     driven = driven_input(robot)
     if world == "reduced":
-        raise InputError("a grasp needs contact, which reduced models lack: choose world simulator or laboratory.")
+        raise InputError(
+            "a grasp needs contact, which reduced models lack: "
+            "choose world simulator or laboratory."
+        )
     if len(driven.parts) != 1 or BASE not in robot.inputs:
         raise InputError(
             "a grasp needs a finger that is fixed at its base and has one input: this robot has "
@@ -185,7 +233,9 @@ def _grippers(task: str, robot: Robot, count: int, world: str, frames: int) -> t
     time_step = robot.time_step
     if world == "laboratory":
         assert robot.folder is not None
-        robot = laboratory_robot(laboratory_settings(robot.folder), upright=True, on_failure="count")
+        robot = laboratory_robot(
+            laboratory_settings(robot.folder), upright=True, on_failure="count"
+        )
     low, high = np.array(driven.low), np.array(driven.high)
     rate = (high - low) / _RISE
     bodies: World[Any]
@@ -199,7 +249,9 @@ def _grippers(task: str, robot: Robot, count: int, world: str, frames: int) -> t
     return bodies, ActionMapping(low, high, rate, np.zeros(len(low)), frames)
 
 
-def _reach(robot: Robot, mapping: ActionMapping, point: FloatArray, shown: list[int] | None, seed: int) -> Reach:
+def _reach(
+    robot: Robot, mapping: ActionMapping, point: FloatArray, shown: list[int] | None, seed: int
+) -> Reach:
     """Samples equilibria of the robot under random inputs within their range."""
     low, high = mapping.low, mapping.high
     shares = np.random.default_rng(seed).random((_PLACES, len(low)))
@@ -209,7 +261,9 @@ def _reach(robot: Robot, mapping: ActionMapping, point: FloatArray, shown: list[
         q, settled = settle_some(robot, len(shares), **inputs)
         markers = robot.observe(robot.state(q[settled])).double().cpu().numpy()
     markers = markers if shown is None else markers[:, shown]
-    return Reach(markers.reshape(len(markers), -1) @ point.T, 2.0 * shares[settled.cpu().numpy()] - 1.0)
+    return Reach(
+        markers.reshape(len(markers), -1) @ point.T, 2.0 * shares[settled.cpu().numpy()] - 1.0
+    )
 
 
 def _up(robot: Robot) -> FloatArray:
@@ -235,24 +289,40 @@ def _spread_vertices(robot: Robot) -> list[int]:
     return chosen
 
 
-def _tip(robot: Robot, markers: FloatArray, tracked: Sequence[str] | None, shown: Sequence[int] | None) -> FloatArray:
+def _tip(
+    robot: Robot, markers: FloatArray, tracked: Sequence[str] | None, shown: Sequence[int] | None
+) -> FloatArray:
     """Matrix (3, 3 M) from markers (M, 3) to the point of the task, the mean of some of them."""
     names = robot.labels or [str(vertex) for vertex in shown or ()]
     far = np.linalg.norm(markers - _fixed(robot), axis=1)
-    of_tip = [name for name, distance in zip(names, far, strict=True) if distance >= _NEAR_TIP * far.max()]
+    of_tip = [
+        name for name, distance in zip(names, far, strict=True) if distance >= _NEAR_TIP * far.max()
+    ]
     return tracked_of(names, of_tip if tracked is None else tracked)
 
 
 class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """A single robot as a Gymnasium environment, with the arguments of `make_vector`."""
 
-    def __init__(self, task: str, run: str | Path | Robot, render_mode: str | None = None, **settings: Any) -> None:
+    def __init__(
+        self, task: str, run: str | Path | Robot, render_mode: str | None = None, **settings: Any
+    ) -> None:
         self._one = make_vector(
-            task, run, 1, render_mode=render_mode, autoreset_mode=gym.vector.AutoresetMode.DISABLED, **settings
+            task,
+            run,
+            1,
+            render_mode=render_mode,
+            autoreset_mode=gym.vector.AutoresetMode.DISABLED,
+            **settings,
         )
-        self.observation_space, self.action_space = self._one.single_observation_space, self._one.single_action_space
+        self.observation_space, self.action_space = (
+            self._one.single_observation_space,
+            self._one.single_action_space,
+        )
         self.render_mode = render_mode
-        self.metadata = {key: value for key, value in self._one.metadata.items() if key != "autoreset_mode"}
+        self.metadata = {
+            key: value for key, value in self._one.metadata.items() if key != "autoreset_mode"
+        }
 
     @override
     def reset(
@@ -263,7 +333,9 @@ class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._one.reset(seed=first)[0][0], {}
 
     @override
-    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         seen, reward, terminated, truncated, info = self._one.step(np.asarray(action)[None])
         first = {"error_mm": float(info["error_mm"][0])}
         return seen[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), first
@@ -279,7 +351,9 @@ class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 def register() -> None:
-    """Registers the tasks in Gymnasium, as ``warp_resphys/Reach-v0``, ``warp_resphys/Follow-v0`` and so on."""
+    """Registers the tasks in Gymnasium, as ``warp_resphys/Reach-v0``,
+    ``warp_resphys/Follow-v0`` and so on.
+    """
     for task in TASKS:
         name = f"warp_resphys/{''.join(word.capitalize() for word in task.split('_'))}-v0"
         if name not in gym.registry:

@@ -23,7 +23,9 @@ _UPDATE: Final = 2048  # actions of all robots between updates of the policy, at
 _BATCH: Final = 512  # actions, at most
 _NETWORK: Final = 128  # width of the policy's layers
 _ORDER: Final = 2  # of the polynomial from actions to equilibria
-_EFFORT: Final = 3e-3  # weight of squared actions beside the squared distance, for places of size one
+_EFFORT: Final = (
+    3e-3  # weight of squared actions beside the squared distance, for places of size one
+)
 _CHANGE = 1e-6  # of actions for derivatives
 _STILL = 0.1  # observed change of positions in an action
 _ARM_SPEED: Final = 0.15  # largest speed of a gripper on an arm [m/s]
@@ -32,11 +34,13 @@ _NEAR: Final = 1.2e-3  # distance from a place that is reached [m]
 _UNMOVED: Final = 0.02  # observed change of positions of an arm in an action
 _RISEN: Final = 0.03  # share of the height to lift a ball at which it is in the air
 _END: Final = 1e-3  # distance of the fingers' command from the end of its range
-_ITERATIONS, _STRIDE = 16, 0.25  # Gauss-Newton iterations, and the largest change of an action in one
+# Gauss-Newton iterations, and the largest change of an action in one
+_ITERATIONS, _STRIDE = 16, 0.25
 
 
 class ScriptedPolicy:
-    """Commands the inputs whose equilibrium is nearest to one of the observed goals, with a small penalty on effort.
+    """Commands the inputs whose equilibrium is nearest to one of the observed goals,
+    with a small penalty on effort.
 
     It is quasi-static: where the robot is slow it is late, and it does not damp vibrations.
 
@@ -49,13 +53,19 @@ class ScriptedPolicy:
         InputError: the task has no goals.
     """
 
-    def __init__(self, environment: RobotVectorEnv, ahead: int = 0, reach: Reach | None = None) -> None:
+    def __init__(
+        self, environment: RobotVectorEnv, ahead: int = 0, reach: Reach | None = None
+    ) -> None:
         task = environment.task
         if not isinstance(task, GoalTask):
             raise InputError("the scripted policy needs a task with goals: choose reach or follow.")
         reach = task.reach if reach is None else reach
         self._rests = Polynomial.fitted(reach.actions, reach.places / task.size, _ORDER)
-        self._rest, self._tracked, self._size = environment.rests[0].ravel(), environment.tracked, task.size
+        self._rest, self._tracked, self._size = (
+            environment.rests[0].ravel(),
+            environment.tracked,
+            task.size,
+        )
         self._parts, self._ahead = task.reach.actions.shape[1], ahead
 
     def __call__(self, seen: Observation) -> NDArray[np.float32]:
@@ -67,22 +77,29 @@ class ScriptedPolicy:
         return self._actions(goal / self._size).astype(np.float32)
 
     def _actions(self, goals: FloatArray) -> FloatArray:
-        """Actions (B, n) whose equilibria are closest to goals (B, 3), by Gauss-Newton's method within the bounds."""
+        """Actions (B, n) whose equilibria are closest to goals (B, 3),
+        by Gauss-Newton's method within the bounds.
+        """
         actions = np.zeros((len(goals), self._parts))
         for _ in range(_ITERATIONS):
             moved = np.stack([self._rests(at) for at in around(actions, _CHANGE)])  # (1 + n, B, 3)
             slope = ((moved[1:] - moved[0]) / _CHANGE).swapaxes(0, 1)  # (B, n, 3)
             matrix = slope @ slope.swapaxes(1, 2) + _EFFORT * np.eye(self._parts)
             force = (slope @ (goals - moved[0])[..., None])[..., 0] - _EFFORT * actions
-            at_bound = (np.abs(actions) >= 1.0) & (actions * force > 0.0)  # at a bound, and pushed beyond it
-            matrix = np.where(at_bound[:, :, None] | at_bound[:, None, :], np.eye(self._parts), matrix)
+            # At a bound, and pushed beyond it.
+            at_bound = (np.abs(actions) >= 1.0) & (actions * force > 0.0)
+            matrix = np.where(
+                at_bound[:, :, None] | at_bound[:, None, :], np.eye(self._parts), matrix
+            )
             change = np.linalg.solve(matrix, np.where(at_bound, 0.0, force)[..., None])[..., 0]
             actions = np.clip(actions + np.clip(change, -_STRIDE, _STRIDE), -1.0, 1.0)
         return actions
 
 
 class ScriptedGrasp:
-    """Closes a gripper with a share of the range of its input, and lifts when its fingers stand still."""
+    """Closes a gripper with a share of the range of its input,
+    and lifts when its fingers stand still.
+    """
 
     def __init__(self, share: float) -> None:
         self._action = 2.0 * share - 1.0
@@ -92,14 +109,16 @@ class ScriptedGrasp:
         displacements, command, height = (seen.shape[1] - 3) // 2, seen[:, -3], seen[:, -2]
         still = np.abs(seen[:, displacements:-3]).max(axis=1) < _STILL
         lifts = (height > -1.0) | (still & (command > self._action - 1e-3))
-        return np.stack([np.full(len(seen), self._action), np.where(lifts, 1.0, -1.0)], 1).astype(np.float32)
+        return np.stack([np.full(len(seen), self._action), np.where(lifts, 1.0, -1.0)], 1).astype(
+            np.float32
+        )
 
 
 class ScriptedPlace:
     """Picks a ball and places it: above the ball, down, close, up, above the goal, down, open, up.
 
-    The observation tells which of these is next. The angles of the joints follow from one Newton step with MuJoCo's
-    Jacobian towards the next place of the gripper, which stays upright.
+    The observation tells which of these is next. The angles of the joints follow from one Newton
+    step with MuJoCo's Jacobian towards the next place of the gripper, which stays upright.
 
     Args:
         environment: with the task ``pick_and_place``.
@@ -128,7 +147,9 @@ class ScriptedPlace:
         closes, move, up = not is_open, np.zeros(3), np.array([0.0, 0.0, 1.1 * LIFT])
 
         def down(way: FloatArray) -> tuple[FloatArray, bool]:
-            """Returns the move along a way (3,), first above its end, and whether the end is reached."""
+            """Returns the move along a way (3,), first above its end,
+            and whether the end is reached.
+            """
             above = float(np.linalg.norm(way[:2])) > _NEAR
             return way + above * up, still and not above and abs(float(way[2])) < _NEAR
 
@@ -145,23 +166,33 @@ class ScriptedPlace:
         return np.append(1.0 if closes else -1.0, self._turned(angles, move))
 
     def _turned(self, angles: FloatArray, move: FloatArray) -> FloatArray:
-        """Returns commands (6,) of joints, now at angles (6,), for a part of a move (3,) of the gripper [m]."""
+        """Returns commands (6,) of joints, now at angles (6,),
+        for a part of a move (3,) of the gripper [m].
+        """
         world, mujoco = self._world, mujoco_package()
         half, model = 0.5 * (world.high - world.low), world.mount.model
         data, jacobian = mujoco.MjData(model), np.empty((6, model.nv))
         data.qpos[:] = world.low + half * (angles + 1.0)
         mujoco.mj_fwdPosition(model, data)
         pose = base_pose(model, data, FLANGE, PALM)
-        mujoco.mj_jac(model, data, jacobian[:3], jacobian[3:], pose[:3] + world.held, model.body(FLANGE).id)
+        mujoco.mj_jac(
+            model, data, jacobian[:3], jacobian[3:], pose[:3] + world.held, model.body(FLANGE).id
+        )
         move = _GAIN * move
         move *= min(1.0, self._longest / max(float(np.linalg.norm(move)), 1e-12))
         return np.asarray(angles + np.linalg.solve(jacobian, np.append(move, -pose[3:])) / half)
 
 
 def errors_mm(
-    environment: RobotVectorEnv, policy: Policy, seed: int, on_action: Callable[[], None] = lambda: None
+    environment: RobotVectorEnv,
+    policy: Policy,
+    seed: int,
+    on_action: Callable[[], None] = lambda: None,
 ) -> FloatArray:
-    """Distances (A, B) of the points from their goals in one episode of B robots [mm]; NaN after a failure."""
+    """Distances (A, B) of the points from their goals in one episode of B robots [mm].
+
+    NaN after a failure.
+    """
     seen, _ = environment.reset(seed=seed)
     errors = np.full((environment.actions, environment.num_envs), np.nan)
     alive = np.ones(environment.num_envs, dtype=np.bool_)
@@ -174,9 +205,13 @@ def errors_mm(
 
 
 def learn(
-    environment: RobotVectorEnv, steps: int, seed: int = 0, on_progress: Callable[[int], None] = lambda steps: None
+    environment: RobotVectorEnv,
+    steps: int,
+    seed: int = 0,
+    on_progress: Callable[[int], None] = lambda steps: None,
 ) -> Any:
-    """Trains a policy by proximal policy optimisation (PPO, Schulman et al. 2017), with Stable-Baselines3.
+    """Trains a policy by proximal policy optimisation (PPO, Schulman et al. 2017),
+    with Stable-Baselines3.
 
     Args:
         environment: with ``autoreset_mode`` SAME_STEP.

@@ -24,7 +24,9 @@ class Robots(VecEnv):
     def __init__(self, environment: RobotVectorEnv) -> None:
         self.environment = environment
         count = environment.num_envs
-        super().__init__(count, environment.single_observation_space, environment.single_action_space)
+        super().__init__(
+            count, environment.single_observation_space, environment.single_action_space
+        )
         self._actions = np.zeros((count, environment.world.parts), dtype=np.float32)
 
     @override
@@ -38,7 +40,9 @@ class Robots(VecEnv):
         self._actions = actions
 
     @override
-    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    def step_wait(
+        self,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         seen, rewards, terminated, truncated, info = self.environment.step(self._actions)
         over = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in over]
@@ -62,7 +66,9 @@ class Robots(VecEnv):
         setattr(self.environment, attr_name, value)
 
     @override
-    def env_method(self, method_name: str, *arguments: Any, indices: Any = None, **named: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *arguments: Any, indices: Any = None, **named: Any
+    ) -> list[Any]:
         result = getattr(self.environment, method_name)(*arguments, **named)
         return [result] * len(list(self._get_indices(indices)))
 

@@ -1,4 +1,7 @@
-"""Tasks: reach a place, follow a figure, swing up, pick and place. The largest reward of a step is one."""
+"""Tasks: reach a place, follow a figure, swing up, pick and place.
+
+The largest reward of a step is one.
+"""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -16,8 +19,11 @@ _FIGURES: Final = ("circle", "eight", "R", "E", "S")
 _LAPS_S: Final = (2.0, 5.0)  # range of the durations of a figure [s]
 _OF_REACH: Final = 0.6  # size of a figure, as a share of the reach
 LIFT: Final = 0.03  # height by which a ball is lifted before it is put down [m]
-_FROM_BALL: Final = 0.15  # size of the task to pick and place, about the first distance of the gripper [m]
-_AHEAD, _ASIDE = (-0.04, 0.04), (0.06, 0.12)  # ranges of goals from the ball, along and across the arm [m]
+_FROM_BALL: Final = (
+    0.15  # size of the task to pick and place, about the first distance of the gripper [m]
+)
+# Ranges of goals from the ball, along and across the arm [m].
+_AHEAD, _ASIDE = (-0.04, 0.04), (0.06, 0.12)
 
 
 @dataclass(frozen=True)
@@ -75,7 +81,8 @@ class RobotTask(ABC):
 class GoalTask(RobotTask):
     """A task of goals (B, A + 1, 3), at the start and after each of A actions [m].
 
-    The vectors to the next goals are observed; the reward is one minus the distance over the size of the reach.
+    The vectors to the next goals are observed; the reward is one minus the distance over the size
+    of the reach.
     """
 
     def __init__(self, count: int, actions: int, reach: Reach) -> None:
@@ -111,7 +118,8 @@ class ReachTask(GoalTask):
 
 
 class FollowTask(GoalTask):
-    """Follow a figure at a random speed, from a random point of it, in the plane in which the robot reaches furthest.
+    """Follow a figure at a random speed, from a random point of it,
+    in the plane in which the robot reaches furthest.
 
     Args:
         count: B.
@@ -133,13 +141,20 @@ class FollowTask(GoalTask):
         size = _OF_REACH * float(spread) * random.uniform(0.5, 1.0)
         curve = Path(name, size, tuple(reach.middle), tuple(first), tuple(second)).points
         curve = np.concatenate([curve, curve[-2::-1]])  # there and back, a closed curve
-        laps = self._time * np.arange(self.goals.shape[1]) / random.uniform(*_LAPS_S) + random.uniform()
+        laps = (
+            self._time * np.arange(self.goals.shape[1]) / random.uniform(*_LAPS_S)
+            + random.uniform()
+        )
         at = (laps % 1.0) * (len(curve) - 1)
-        self.goals[row] = np.stack([np.interp(at, np.arange(len(curve)), column) for column in curve.T], axis=1)
+        self.goals[row] = np.stack(
+            [np.interp(at, np.arange(len(curve)), column) for column in curve.T], axis=1
+        )
 
 
 class SwingTask(RobotTask):
-    """Swing a point up by moving the base; the reward is its height above rest over the body's length, up to one.
+    """Swing a point up by moving the base.
+
+    The reward is its height above rest over the body's length, up to one.
 
     Args:
         count: B.
@@ -150,7 +165,9 @@ class SwingTask(RobotTask):
 
     def __init__(self, count: int, up: FloatArray, rest: FloatArray, length: float) -> None:
         if not length > 0.0:
-            raise InputError("swing_up needs a tracked point away from the base: choose others in tracked.")
+            raise InputError(
+                "swing_up needs a tracked point away from the base: choose others in tracked."
+            )
         self._up, self._rest, self._count = up / np.linalg.norm(up), rest, count
         self.size, self.width = length, 1
 
@@ -181,10 +198,11 @@ class SwingTask(RobotTask):
 class PlaceTask(RobotTask):
     """Lift a ball from a table, and put it down on a place to one side of where it was.
 
-    Points (B, 6) are the middle of the gripper and that of the ball. With the greatest height g of the ball since the
-    episode began, over the height to lift it, and distances d over the size of the task, all from 0 to 1, the reward is
-    (max(1 - d(gripper, ball), g) + g + g (1 - d(ball, goal))) / 3. The vectors from gripper to ball and from ball to
-    goal, and g, are observed.
+    Points (B, 6) are the middle of the gripper and that of the ball. With the greatest height g of
+    the ball since the episode began, over the height to lift it, and distances d over the size of
+    the task, all from 0 to 1, the reward is
+    (max(1 - d(gripper, ball), g) + g + g (1 - d(ball, goal))) / 3. The vectors from gripper to ball
+    and from ball to goal, and g, are observed.
 
     Args:
         count: B.
@@ -199,7 +217,11 @@ class PlaceTask(RobotTask):
     @override
     def begin(self, row: int, random: np.random.Generator) -> None:
         side = random.choice([-1.0, 1.0])
-        self.goals[row] = self._rest + [random.uniform(*_AHEAD), side * random.uniform(*_ASIDE), 0.0]
+        self.goals[row] = self._rest + [
+            random.uniform(*_AHEAD),
+            side * random.uniform(*_ASIDE),
+            0.0,
+        ]
         self._lifted[row] = 0.0
 
     @override
@@ -213,9 +235,12 @@ class PlaceTask(RobotTask):
         gripper, ball = points[:, :3], points[:, 3:]
         self._lifted = np.clip((ball[:, 2] - self._rest[2]) / LIFT, self._lifted, 1.0)
         near, placed = (
-            np.clip(1.0 - np.linalg.norm(ball - other, axis=1) / self.size, 0.0, 1.0) for other in (gripper, self.goals)
+            np.clip(1.0 - np.linalg.norm(ball - other, axis=1) / self.size, 0.0, 1.0)
+            for other in (gripper, self.goals)
         )
-        return np.asarray((np.maximum(near, self._lifted) + self._lifted + self._lifted * placed) / 3.0)
+        return np.asarray(
+            (np.maximum(near, self._lifted) + self._lifted + self._lifted * placed) / 3.0
+        )
 
     @override
     def errors_mm(self, points: FloatArray, number: IntArray) -> FloatArray:

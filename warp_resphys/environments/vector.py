@@ -1,4 +1,6 @@
-"""The vector environment: B robots that take actions and return markers, rewards and ends of episodes; its pictures."""
+"""The vector environment: B robots that take actions and return markers,
+rewards and ends of episodes; its pictures.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -51,9 +53,10 @@ class ActionMapping:
 class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     """B robots with one task, whose episodes end and begin independently.
 
-    An observation contains the displacements of the M markers from rest, divided by the size of the task; their changes
-    since the last action; the current inputs, from -1 to 1; the observed values of the task; and forces, if they are
-    observed. An action gives target values of the inputs, from -1 to 1, which are approached at their largest rate.
+    An observation contains the displacements of the M markers from rest, divided by the size of the
+    task; their changes since the last action; the current inputs, from -1 to 1; the observed values
+    of the task; and forces, if they are observed. An action gives target values of the inputs, from
+    -1 to 1, which are approached at their largest rate.
 
     Args:
         world: the simulated bodies.
@@ -96,14 +99,20 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         squeeze: float = 0.0,
     ) -> None:
         if render_mode not in (None, *RENDER_MODES):
-            raise InputError(f"render_mode is {render_mode!r}: choose rgb_array, for pictures as arrays.")
+            raise InputError(
+                f"render_mode is {render_mode!r}: choose rgb_array, for pictures as arrays."
+            )
         self.world, self.task, self._mapping, self.tracked = world, task, mapping, tracked
         self.actions, self.frames = actions, mapping.frames
         self._noise = noise if world.noise is None else world.noise
         self.num_envs, self.render_mode = world.count, render_mode
         mode = AutoresetMode(autoreset_mode)
         rate = round(1.0 / (world.time_step * mapping.frames))
-        self.metadata = {"render_modes": [*RENDER_MODES], "render_fps": rate, "autoreset_mode": mode}
+        self.metadata = {
+            "render_modes": [*RENDER_MODES],
+            "render_fps": rate,
+            "autoreset_mode": mode,
+        }
         self._up = np.asarray(up, dtype=np.float64)
         self._camera: Camera | None = None
         self._mode = mode
@@ -116,7 +125,9 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
             world.squeeze(self.state)
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (width,), np.float32)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (world.parts,), np.float32)
-        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, world.count)
+        self.observation_space = gym.vector.utils.batch_space(
+            self.single_observation_space, world.count
+        )
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, world.count)
         self._random: list[np.random.Generator] | None = None
         self._commands = np.tile(mapping.start, (world.count, 1))
@@ -126,13 +137,17 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
 
     @override
     def reset(
-        self, *, seed: int | Sequence[int | None] | IntArray | None = None, options: Mapping[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | IntArray | None = None,
+        options: Mapping[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begins new episodes of all robots, with newly drawn parameters, or of those in ``options["reset_mask"]``.
+        """Begins new episodes of all robots, with newly drawn parameters, or of those in
+        ``options["reset_mask"]``.
 
         Args:
-            seed: of the first robot, followed by the next integers for the others; or a seed for each robot. Robots
-                that the mask leaves out keep their random numbers.
+            seed: of the first robot, followed by the next integers for the others; or a seed for
+                each robot. Robots that the mask leaves out keep their random numbers.
             options: ``reset_mask``, (B,) bool.
 
         Raises:
@@ -145,7 +160,9 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         if seed is not None or self._random is None:
             drawn = _generators(seed, count)
             kept = drawn if self._random is None else self._random
-            self._random = [new if begins else old for new, old, begins in zip(drawn, kept, chosen, strict=True)]
+            self._random = [
+                new if begins else old for new, old, begins in zip(drawn, kept, chosen, strict=True)
+            ]
         if chosen.all():
             self.world.vary(self._random)
         self._begin(chosen)
@@ -161,7 +178,10 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         rows = chosen[:, None, None]
         self.rests = np.where(rows, self.world.markers(self.state), self.rests)
         seen = self._cameras(chosen)
-        self._seen, self._before = np.where(rows, seen, self._seen), np.where(rows, seen, self._before)
+        self._seen, self._before = (
+            np.where(rows, seen, self._seen),
+            np.where(rows, seen, self._before),
+        )
 
     def _cameras(self, chosen: BoolArray) -> FloatArray:
         """Observed markers (B, M, 3) [m], with noise for the chosen robots."""
@@ -175,7 +195,9 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     @property
     def _points(self) -> FloatArray:
         """Points (B, 3) or (B, 6) of the task, without noise [m]."""
-        return np.asarray(self.world.markers(self.state).reshape(self.num_envs, -1) @ self.tracked.T)
+        return np.asarray(
+            self.world.markers(self.state).reshape(self.num_envs, -1) @ self.tracked.T
+        )
 
     def _errors(self) -> FloatArray:
         """Distances (B,) of the points from their current goals [mm]."""
@@ -192,7 +214,9 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         if self.render_mode is None:
             return None
         if self._random is None:
-            raise InputError("the environment was not reset: call env.reset(seed=...) before env.render().")
+            raise InputError(
+                "the environment was not reset: call env.reset(seed=...) before env.render()."
+            )
         triangles, vertices = self.world.bodies(self.state)
         rigid = self.world.rigid(self.state)
         markers, number = self.world.markers(self.state), self._number
@@ -202,7 +226,9 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
             middle = np.concatenate([self.rests[0], vertices[0]]).mean(axis=0)
             around = np.concatenate([-np.eye(3), np.eye(3)]) * self.task.size
             ways = np.stack([np.zeros(3), self.world.travel])[:, None]
-            seen = np.concatenate([self.rests[0], *(vertices[0] + ways), rigid[1][0], *wanted, middle + around])
+            seen = np.concatenate(
+                [self.rests[0], *(vertices[0] + ways), rigid[1][0], *wanted, middle + around]
+            )
             self._camera = Camera(self._up, seen, self.world.obstacles())
         errors = self._errors()
         seconds = number * self.world.time_step * self._mapping.frames
@@ -217,11 +243,19 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
 
     def _observed(self) -> Observation:
         count, size = self.num_envs, self.task.size
-        off, moved = ((self._seen - start).reshape(count, -1) / size for start in (self.rests, self._before))
+        off, moved = (
+            (self._seen - start).reshape(count, -1) / size for start in (self.rests, self._before)
+        )
         mapping = self._mapping
         commands = 2.0 * (self._commands - mapping.low) / (mapping.high - mapping.low) - 1.0
         task = self.task.observed(self._seen.reshape(count, -1) @ self.tracked.T, self._number)
-        parts = [off, 5.0 * moved, commands, task, *([self.world.forces(self.state)] if self._forces else [])]
+        parts = [
+            off,
+            5.0 * moved,
+            commands,
+            task,
+            *([self.world.forces(self.state)] if self._forces else []),
+        ]
         return np.concatenate(parts, axis=1).astype(np.float32)
 
     @override
@@ -234,20 +268,32 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
             actions: (B, n) from -1 to 1.
 
         Raises:
-            InputError: the environment was not reset, or the actions have another shape or are not finite.
+            InputError: the environment was not reset, or the actions have another shape or are not
+                finite.
         """
         if self._random is None:
-            raise InputError("the environment was not reset: call env.reset(seed=...) before env.step(...).")
+            raise InputError(
+                "the environment was not reset: call env.reset(seed=...) before env.step(...)."
+            )
         chosen, mapping = np.asarray(actions, dtype=np.float64), self._mapping
         if chosen.shape != (self.num_envs, self.world.parts) or not np.isfinite(chosen).all():
             raise InputError(
-                f"actions have shape {chosen.shape}: give finite values of shape {(self.num_envs, self.world.parts)}, "
-                "from -1 to 1."
+                f"actions have shape {chosen.shape}: give finite values of shape "
+                f"{(self.num_envs, self.world.parts)}, from -1 to 1."
             )
-        beginning = self._over.copy() if self._mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._over)
+        beginning = (
+            self._over.copy()
+            if self._mode is AutoresetMode.NEXT_STEP
+            else np.zeros_like(self._over)
+        )
         if self._mode is AutoresetMode.DISABLED and self._over.any():
-            raise InputError("an episode is over: reset it with options={'reset_mask': ...} before the next step.")
-        wanted = mapping.low + 0.5 * (np.clip(chosen, -1.0, 1.0) + 1.0) * (mapping.high - mapping.low)
+            raise InputError(
+                "an episode is over: reset it with options={'reset_mask': ...} before the next "
+                "step."
+            )
+        wanted = mapping.low + 0.5 * (np.clip(chosen, -1.0, 1.0) + 1.0) * (
+            mapping.high - mapping.low
+        )
         last, frames = self._commands.copy(), np.arange(1, mapping.frames + 1)[:, None, None]
         most = mapping.rate * self.world.time_step * frames
         commands = last + np.clip(wanted - last, -most, most)  # (F, B, n)
@@ -257,7 +303,9 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         self._number += 1
         self._before, self._seen = self._seen, self._cameras(np.ones_like(lost))
         changed = (self._commands - last) / (mapping.high - mapping.low)
-        rewards = self.task.reward(self._points, self._number) - _SMOOTH * np.square(changed).mean(axis=1)
+        rewards = self.task.reward(self._points, self._number) - _SMOOTH * np.square(changed).mean(
+            axis=1
+        )
         if self._squeeze:
             rewards = rewards - self._squeeze * self.world.squeeze(self.state)
         rewards = np.where(lost, _LOST, rewards)
@@ -275,13 +323,20 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
             for row in np.flatnonzero(over):
                 final[row] = last_seen[row]
             infos |= {"final_obs": final, "_final_obs": over}
-            infos |= {"final_info": {"error_mm": infos["error_mm"], "_error_mm": over}, "_final_info": over}
+            infos |= {
+                "final_info": {"error_mm": infos["error_mm"], "_error_mm": over},
+                "_final_info": over,
+            }
             self._begin(over)
         return self._observed(), rewards, terminated, truncated, infos
 
 
-def _generators(seed: int | Sequence[int | None] | IntArray | None, count: int) -> list[np.random.Generator]:
-    """Returns a generator for each of B robots, from the seed of the first one or a seed for each; None: any.
+def _generators(
+    seed: int | Sequence[int | None] | IntArray | None, count: int
+) -> list[np.random.Generator]:
+    """Returns a generator for each of B robots, from the seed of the first one or a seed for each.
+
+    None: any.
 
     Raises:
         InputError: seeds that are no whole numbers from zero on, or another number of them.
@@ -289,9 +344,20 @@ def _generators(seed: int | Sequence[int | None] | IntArray | None, count: int) 
     first = np.random.default_rng().integers(2**31) if seed is None else seed
     given = np.asarray(first, dtype=object)
     seeds = [*given] if given.ndim else [given.item()]
-    known = [isinstance(number, int | np.integer) and number >= 0 for number in seeds if number is not None]
-    if not all(known) or (not known and not given.ndim) or len(seeds) != (count if given.ndim else 1):
-        raise InputError(f"seed is {seed!r}: give a whole number from zero on, or {count} of them, one for each robot.")
+    known = [
+        isinstance(number, int | np.integer) and number >= 0
+        for number in seeds
+        if number is not None
+    ]
+    if (
+        not all(known)
+        or (not known and not given.ndim)
+        or len(seeds) != (count if given.ndim else 1)
+    ):
+        raise InputError(
+            f"seed is {seed!r}: give a whole number from zero on, "
+            f"or {count} of them, one for each robot."
+        )
     if not given.ndim:
         seeds = [int(seeds[0]) + number for number in range(count)]
     return [np.random.default_rng(number) for number in seeds]
@@ -311,7 +377,9 @@ class Camera:
 
     def __init__(self, up: FloatArray, points: FloatArray, obstacles: ObstacleSurface) -> None:
         self._axes = side_axes(up, _TURN, _TILT)
-        self._focus, half = frame_of(np.concatenate([points, obstacles.near(points)]), self._axes, _MARGIN)
+        self._focus, half = frame_of(
+            np.concatenate([points, obstacles.near(points)]), self._axes, _MARGIN
+        )
         self._half = float(half.max())
         self._around = obstacle_layers(obstacles.points, obstacles.triangles)
         self._renderer = Renderer()
@@ -333,13 +401,16 @@ class Camera:
             markers: (B, M, 3) [m].
             goals: B paths or places (K, 3) of their tasks [m].
             texts: B captions.
-            rigid: triangles (R, 3) and vertices (B, N, 3) [m] of rigid bodies that carry the robots.
+            rigid: triangles (R, 3) and vertices (B, N, 3) [m] of rigid bodies that carry the
+                robots.
 
         Raises:
             DrawingError: this machine cannot render.
         """
         most = max(map(len, goals))
-        paths = np.stack([np.pad(path, ((0, most - len(path)), (0, 0)), mode="edge") for path in goals])
+        paths = np.stack(
+            [np.pad(path, ((0, most - len(path)), (0, 0)), mode="edge") for path in goals]
+        )
         before = {name: self._half * share for name, share in _BEFORE.items()}
         radii = {name: self._half * share for name, share in _RADII.items()}
         layers = [
@@ -348,13 +419,17 @@ class Camera:
             Layer("balls", markers, None, INK, size=radii["marker"], shift=before["markers"]),
         ]
         if most > 1:
-            layers.append(Layer("lines", paths, chain(most), _GOAL, size=2.0, shift=before["goals"]))
+            layers.append(
+                Layer("lines", paths, chain(most), _GOAL, size=2.0, shift=before["goals"])
+            )
         if len(triangles):
             layers += body_layers(vertices, triangles, self._half, width=1.5)
         if rigid is not None:
             layers += obstacle_layers(rigid[1], rigid[0], colour=CARRIER)
         view = View(layers, self._axes, self._focus, self._half)
-        return list(self._renderer.frames(RenderScene([view], _SIZE, background="white", texts=texts)))
+        return list(
+            self._renderer.frames(RenderScene([view], _SIZE, background="white", texts=texts))
+        )
 
     def close(self) -> None:
         """Ends the rendering process."""

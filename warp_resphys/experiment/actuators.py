@@ -1,4 +1,6 @@
-"""Energies of a configured body: actuators, the input that drives them, a fluid, and contact with obstacles."""
+"""Energies of a configured body: actuators, the input that drives them,
+a fluid, and contact with obstacles.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,15 +32,16 @@ _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {
     "muscles": {"stress": STRESS, "contraction": MUSCLE_CONTRACTION},
 }
 DRIVING_QUANTITIES: Final[Mapping[str, Quantity]] = {
-    quantity.name: quantity for quantity in (PRESSURE, *(q for group in _COMMANDED.values() for q in group.values()))
+    quantity.name: quantity
+    for quantity in (PRESSURE, *(q for group in _COMMANDED.values() for q in group.values()))
 }
 
 
 def build_actuators(settings: BodySettings, mesh: Mesh) -> list[Energy]:
     """Builds the energies of a body besides its material.
 
-    Those of ``chambers``, ``fibres``, ``tendons``, ``muscles``, ``medium``, ``obstacles`` and ``self_contact``, and
-    ``energies`` of other packages.
+    Those of ``chambers``, ``fibres``, ``tendons``, ``muscles``, ``medium``, ``obstacles`` and
+    ``self_contact``, and ``energies`` of other packages.
 
     Args:
         settings: of the body.
@@ -51,13 +54,21 @@ def build_actuators(settings: BodySettings, mesh: Mesh) -> list[Energy]:
     energies: list[Energy] = [Pressure(chambers)] if chambers else []
     if settings.fibres is not None:
         if settings.chambers is None:
-            raise InputError("fibres is set, but chambers is null: fibres need chambers, so leave them out.")
+            raise InputError(
+                "fibres is set, but chambers is null: fibres need chambers, so leave them out."
+            )
         closed = chambers[: settings.chambers.count]
-        around = closed if settings.fibres.around == "chambers" else (outer_surface(mesh, settings.chambers.axis),)
+        around = (
+            closed
+            if settings.fibres.around == "chambers"
+            else (outer_surface(mesh, settings.chambers.axis),)
+        )
         wound = {key: value for key, value in settings.fibres if key != "around"}
         energies.append(Fibres(around, axis=settings.chambers.axis, **wound))
     if settings.tendons is not None:
-        energies.append(Tendons(**{key: value for key, value in settings.tendons if key != "commanded"}))
+        energies.append(
+            Tendons(**{key: value for key, value in settings.tendons if key != "commanded"})
+        )
     if settings.muscles is not None:
         energies.append(build_muscles(settings.muscles, mesh))
     if settings.medium is not None:
@@ -75,14 +86,19 @@ def energies_of_packages(settings: BodySettings) -> dict[str, Energy]:
     Raises:
         InputError: see `ClassSettings.factory`.
     """
-    return {name: energy.factory(Energy, f"energies.{name}")() for name, energy in settings.energies.items()}
+    return {
+        name: energy.factory(Energy, f"energies.{name}")()
+        for name, energy in settings.energies.items()
+    }
 
 
 def build_chambers(settings: BodySettings, mesh: Mesh) -> tuple[Chamber, ...]:
-    """Finds the closed chambers of a mesh, and the open faces after them, if the group ``chambers`` is set.
+    """Finds the closed chambers of a mesh, and the open faces after them,
+    if the group ``chambers`` is set.
 
     Raises:
-        InputError: their number differs from ``chambers.count``, or open faces have the name of one of them.
+        InputError: their number differs from ``chambers.count``, or open faces have the name of one
+            of them.
         MeshError: no face lies at a place, or the mesh has no such surface.
     """
     if (group := settings.chambers) is None:
@@ -90,26 +106,37 @@ def build_chambers(settings: BodySettings, mesh: Mesh) -> tuple[Chamber, ...]:
     closed = find_chambers(mesh, group.axis)
     if len(closed) != group.count:
         raise InputError(
-            f"the mesh has {len(closed)} closed chambers, but chambers.count is {group.count}: open chambers do "
-            "not count, so close them in the mesh, name them in chambers.faces, or change chambers.count."
+            f"the mesh has {len(closed)} closed chambers, but chambers.count is {group.count}: "
+            "open chambers do not count, so close them in the mesh, name them in "
+            "chambers.faces, or change chambers.count."
         )
     if twice := group.faces.keys() & {chamber.name for chamber in closed}:
-        raise InputError(f"chambers.faces.{min(twice)}: a closed chamber has this name: choose another.")
+        raise InputError(
+            f"chambers.faces.{min(twice)}: a closed chamber has this name: choose another."
+        )
     return *closed, *(Chamber(name, _open_faces(settings, mesh, name)) for name in group.faces)
 
 
 def _open_faces(settings: BodySettings, mesh: Mesh, name: str) -> IntArray:
-    """Returns the faces (F, n) of an entry of ``chambers.faces``, by their place or the surface of the mesh file."""
+    """Returns the faces (F, n) of an entry of ``chambers.faces``,
+    by their place or the surface of the mesh file.
+    """
     assert settings.chambers is not None
     place = settings.chambers.faces[name]
     with naming(f"chambers.faces.{name}: "):
         if isinstance(place, Place):
             return faces_at(mesh, place)
         if not isinstance(settings.mesh, FileMesh):
-            raise MeshError("only meshes from a file have named surfaces: give the place of the faces, as in {z: 0.0}")
+            raise MeshError(
+                "only meshes from a file have named surfaces: "
+                "give the place of the faces, as in {z: 0.0}"
+            )
         surfaces = read_surfaces(**settings.mesh.arguments())
         if place not in surfaces:
-            raise MeshError(f"the mesh has no surface {place!r}; it has {', '.join(surfaces) or 'none with a name'}")
+            raise MeshError(
+                f"the mesh has no surface {place!r}; it has "
+                f"{', '.join(surfaces) or 'none with a name'}"
+            )
         return surfaces[place]
 
 
@@ -127,7 +154,9 @@ class Drive:
 
 
 def _driving(settings: BodySettings) -> tuple[Quantity, int] | None:
-    """Input of a body with its number of values; None without. Of energies of other packages it is the first.
+    """Input of a body with its number of values; None without.
+
+    Of energies of other packages it is the first.
 
     Raises:
         InputError: the body has several.
@@ -136,15 +165,24 @@ def _driving(settings: BodySettings) -> tuple[Quantity, int] | None:
     if settings.chambers is not None:
         driving["chambers"] = PRESSURE, settings.chambers.count + len(settings.chambers.faces)
     if settings.tendons is not None:
-        driving["tendons"] = _COMMANDED["tendons"][settings.tendons.commanded], len(settings.tendons.routes)
+        driving["tendons"] = (
+            _COMMANDED["tendons"][settings.tendons.commanded],
+            len(settings.tendons.routes),
+        )
     if settings.muscles is not None and settings.muscles.commanded is not None:
-        driving["muscles"] = _COMMANDED["muscles"][settings.muscles.commanded], len(settings.muscles.bundles)
+        driving["muscles"] = (
+            _COMMANDED["muscles"][settings.muscles.commanded],
+            len(settings.muscles.bundles),
+        )
     for name, energy in energies_of_packages(settings).items():
         if energy.inputs:
             driving[f"energies.{name}"] = energy.inputs[0], energy.count
     if len(driving) > 1:
         first, second, *_ = driving
-        raise InputError(f"{first} and {second} are two inputs of the body, but recordings have one: take one out.")
+        raise InputError(
+            f"{first} and {second} are two inputs of the body, "
+            "but recordings have one: take one out."
+        )
     return next(iter(driving.values()), None)
 
 
@@ -166,7 +204,11 @@ def drive_of(settings: BodySettings, body: Body) -> Drive | None:
     quantity = driving_quantity(settings)
     if quantity is None:
         return None
-    names = next(energy.names for energy in cast(Sequence[Energy], body.energies) if quantity in energy.inputs)
+    names = next(
+        energy.names
+        for energy in cast(Sequence[Energy], body.energies)
+        if quantity in energy.inputs
+    )
     return Drive(quantity, names)
 
 

@@ -50,7 +50,12 @@ from ..settings.mesh import (
     SymmetrySettings,
     TetrahedralBox,
 )
-from ..settings.observed import BindingSettings, ForceSensorSettings, MarkerSettings, RigidBodySettings
+from ..settings.observed import (
+    BindingSettings,
+    ForceSensorSettings,
+    MarkerSettings,
+    RigidBodySettings,
+)
 from .actuators import build_actuators
 
 _BYTES_PER_CELL = 4_000  # lower bound for the mesh, its points and its matrix
@@ -75,7 +80,9 @@ def simulation_device(name: str) -> torch.device:
 
 def _shipped_arms() -> list[str]:
     folder = resources.files("warp_resphys") / "meshes"
-    return sorted(file.name.removesuffix(".msh") for file in folder.iterdir() if file.name.endswith(".msh"))
+    return sorted(
+        file.name.removesuffix(".msh") for file in folder.iterdir() if file.name.endswith(".msh")
+    )
 
 
 def shipped_arm(name: str) -> Mesh:
@@ -85,7 +92,9 @@ def shipped_arm(name: str) -> Mesh:
         InputError: the name is unknown.
     """
     if name not in (names := _shipped_arms()):
-        raise InputError(f"mesh.name is {name!r}: the arms that come with the package are {', '.join(names)}.")
+        raise InputError(
+            f"mesh.name is {name!r}: the arms that come with the package are {', '.join(names)}."
+        )
     with resources.as_file(resources.files("warp_resphys") / "meshes" / f"{name}.msh") as path:
         return read_mesh(path)
 
@@ -136,20 +145,23 @@ def _check_memory(divisions: Sequence[int]) -> None:
     cells, limit = math.prod(divisions), _SHARE_OF_MEMORY * available_memory_gib()
     if (needed := cells * _BYTES_PER_CELL / 2**30) > limit:
         raise InputError(
-            f"mesh.divisions gives {cells:,} cells, which take at least {needed:.3g} GiB, but {limit:.3g} GiB are "
-            "free: use fewer."
+            f"mesh.divisions gives {cells:,} cells, which take at least {needed:.3g} GiB, but "
+            f"{limit:.3g} GiB are free: use fewer."
         )
 
 
 def finer(settings: MeshSettings, times: float) -> MeshSettings:
-    """Refines the group ``mesh`` by a factor: along the edges of a box, along a rod's axis, or everywhere.
+    """Refines the group ``mesh`` by a factor: along the edges of a box,
+    along a rod's axis, or everywhere.
 
-    Linear cells of a file become quadratic, and an arm of the package the next finer one. Cells that are given and
-    cannot be refined stay as they are.
+    Linear cells of a file become quadratic, and an arm of the package the next finer one. Cells
+    that are given and cannot be refined stay as they are.
     """
     match settings:
         case HexahedralBox() | TetrahedralBox():
-            return settings.changed(divisions=[math.ceil(times * cells) for cells in settings.divisions])
+            return settings.changed(
+                divisions=[math.ceil(times * cells) for cells in settings.divisions]
+            )
         case BoxesMesh() | SurfaceMesh():
             return settings.changed(size=settings.size / times)
         case RodMesh():
@@ -165,7 +177,9 @@ def finer(settings: MeshSettings, times: float) -> MeshSettings:
 
 
 def build_material(settings: MaterialSettings, key: str) -> Material | dict[str, Material]:
-    """Builds the material of a group, or the materials of its regions by name; errors begin with the dotted key.
+    """Builds the material of a group, or the materials of its regions by name.
+
+    Errors begin with the dotted key.
 
     Raises:
         InputError: a constant is unknown or out of range.
@@ -190,7 +204,9 @@ def build_body(settings: BodySettings, mesh: Mesh | None = None) -> Body:
     """
     if mesh is not None:
         return _body(settings, mesh)
-    files = tuple(_file_of(mesh) for mesh in (settings.mesh, *(part.mesh for part in settings.parts.values())))
+    files = tuple(
+        _file_of(mesh) for mesh in (settings.mesh, *(part.mesh for part in settings.parts.values()))
+    )
     return _built_body(BodySettings.of(settings), files)
 
 
@@ -216,7 +232,11 @@ def _symmetry_planes(settings: SymmetrySettings | None) -> list[SymmetryPlane]:
         return []
     at = [getattr(settings, axis) for axis in "xyz"]
     normals = np.eye(3).tolist()
-    return [SymmetryPlane(n, x, settings.tolerance) for n, x in zip(normals, at, strict=True) if x is not None]
+    return [
+        SymmetryPlane(n, x, settings.tolerance)
+        for n, x in zip(normals, at, strict=True)
+        if x is not None
+    ]
 
 
 def whole_mesh(settings: BodySettings) -> Mesh:
@@ -238,7 +258,9 @@ def whole_mesh(settings: BodySettings) -> Mesh:
         parts[name] = replace(part_mesh, vertices=part_mesh.vertices + np.asarray(part.shift))
     joined = join({"body": mesh, **parts})
     if twice := joined.regions.keys() & mesh.regions.keys():
-        raise MeshError(f"a part and a region of the first mesh have the name {min(twice)!r}: rename the part.")
+        raise MeshError(
+            f"a part and a region of the first mesh have the name {min(twice)!r}: rename the part."
+        )
     return replace(joined, regions={**joined.regions, **mesh.regions})
 
 
@@ -265,8 +287,11 @@ def _with_regions(mesh: Mesh, settings: BodySettings) -> Mesh:
     return replace(mesh, regions=regions)
 
 
-def bound_markers(settings: BindingSettings, mesh: Mesh, places: ArrayLike, labels: Sequence[str]) -> Markers:
-    """Binds observed points at places (M, 3) on the undeformed body [m], in float64 on the CPU, by `markers`.
+def bound_markers(
+    settings: BindingSettings, mesh: Mesh, places: ArrayLike, labels: Sequence[str]
+) -> Markers:
+    """Binds observed points at places (M, 3) on the undeformed body [m],
+    in float64 on the CPU, by `markers`.
 
     Raises:
         InputError: see `bind_markers`.
@@ -275,16 +300,21 @@ def bound_markers(settings: BindingSettings, mesh: Mesh, places: ArrayLike, labe
     to, points = settings.bind_to, np.asarray(places, dtype=np.float64)
     parts, rows = list[BoundMarkers](), list[list[int]]()
     for body, corners in corners_of(labels).items():
-        parts.append(follow_vertices(mesh, mounted_on(settings.rigid_bodies[body], mesh), points[corners]))
+        parts.append(
+            follow_vertices(mesh, mounted_on(settings.rigid_bodies[body], mesh), points[corners])
+        )
         rows.append(list(range(corners.start, corners.stop)))
     if marked := [row for row, label in enumerate(labels) if label in settings.tracked]:
         tracked = mesh, points[marked], [labels[row] for row in marked]
         if settings.observation is not None:
-            markers = settings.observation.factory(Markers, "markers.observation", len(tracked), "bind")(*tracked)
+            markers = settings.observation.factory(
+                Markers, "markers.observation", len(tracked), "bind"
+            )(*tracked)
             if type(markers).moved is Markers.moved:
                 raise InputError(
-                    f"markers.observation: {type(markers).__name__} has no method moved, which identification "
-                    "and prediction intervals need, as places of markers are not exact: add it, as in Markers."
+                    f"markers.observation: {type(markers).__name__} has no method moved, which "
+                    "identification and prediction intervals need, as places of markers are not "
+                    "exact: add it, as in Markers."
                 )
         else:
             markers = bind_markers(
@@ -317,20 +347,28 @@ def force_sensor(settings: ForceSensorSettings) -> ForceSensor:
 
 
 def nominal_places(settings: BindingSettings, mesh: Mesh) -> FloatArray:
-    """(M, 3) nominal places of the observed points [m]; rigid bodies are aligned with the body, at their part's centre.
+    """(M, 3) nominal places of the observed points [m].
+
+    Rigid bodies are aligned with the body, at their part's centre.
 
     Raises:
         MeshError: see `bound_markers`.
     """
     places = np.array([*settings.tracked.values()], dtype=np.float64).reshape(-1, 3)
     bodies = settings.rigid_bodies.values()
-    return np.concatenate([places, *(mesh.vertices[mounted_on(b, mesh)].mean(axis=0) + arms(b.length) for b in bodies)])
+    return np.concatenate(
+        [
+            places,
+            *(mesh.vertices[mounted_on(b, mesh)].mean(axis=0) + arms(b.length) for b in bodies),
+        ]
+    )
 
 
 def marker_view_of(
     settings: MarkerSettings, labels: Sequence[str], sets: tuple[tuple[int, ...], ...] = ()
 ) -> MarkerView:
-    """View of tracked markers in the recordings, by the group ``markers``: coordinates that are seen, and the frame.
+    """View of tracked markers in the recordings, by the group ``markers``:
+    coordinates that are seen, and the frame.
 
     Args:
         settings: the group.
@@ -341,12 +379,17 @@ def marker_view_of(
         InputError: see `MarkerView`.
     """
     # Rigid bodies are seen in all coordinates, where nominal positions do not matter.
-    nominal = torch.tensor([settings.tracked.get(label, (0.0, 0.0, 0.0)) for label in labels], dtype=torch.float64)
+    nominal = torch.tensor(
+        [settings.tracked.get(label, (0.0, 0.0, 0.0)) for label in labels], dtype=torch.float64
+    )
     return MarkerView(nominal, settings.plane, settings.frame == "own", sets)
 
 
 def build_simulator(
-    settings: SimulatorSettings, material: MaterialSettings, body: Body | None = None, on_failure: str | None = None
+    settings: SimulatorSettings,
+    material: MaterialSettings,
+    body: Body | None = None,
+    on_failure: str | None = None,
 ) -> Simulator:
     """Builds the simulator of a configuration.
 
@@ -359,7 +402,9 @@ def build_simulator(
     Raises:
         InputError: a value cannot be simulated.
     """
-    solver = settings.solver if on_failure is None else settings.solver.changed(on_failure=on_failure)
+    solver = (
+        settings.solver if on_failure is None else settings.solver.changed(on_failure=on_failure)
+    )
     simulator = Simulator(
         build_body(settings) if body is None else body,
         build_material(material, "simulation"),

@@ -20,8 +20,16 @@ def files_read(run: RunSettings, *bodies: BodySettings | None) -> dict[str, str]
     """
     folder = Path((run.recorded.folder if run.recorded is not None else None) or ".").expanduser()
     moved = {motion.file for motion in run.motions().values() if motion.file is not None}
-    motions = {name: digest_of(folder / name, "the file of base_motion or obstacle_motion") for name in sorted(moved)}
-    meshes = [mesh for body in bodies if body for mesh in (body.mesh, *(part.mesh for part in body.parts.values()))]
+    motions = {
+        name: digest_of(folder / name, "the file of base_motion or obstacle_motion")
+        for name in sorted(moved)
+    }
+    meshes = [
+        mesh
+        for body in bodies
+        if body
+        for mesh in (body.mesh, *(part.mesh for part in body.parts.values()))
+    ]
     paths = [getattr(mesh, "path", None) for mesh in meshes]
     return motions | {path: digest(path) for path in paths if path is not None}
 
@@ -35,4 +43,6 @@ def digest_of(path: Path, key: str) -> str:
     try:
         return digest(str(path))
     except OSError as error:
-        raise DataFileError(f"cannot read {path} ({error.strerror}): check data.folder and {key}.") from error
+        raise DataFileError(
+            f"cannot read {path} ({error.strerror}): check data.folder and {key}."
+        ) from error

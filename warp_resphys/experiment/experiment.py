@@ -44,9 +44,11 @@ from .simulate import target_settings
 LAW: Final = "law"
 ACTUATOR: Final = "actuator"
 SIMFREE: Final = "simfree"
-INTERVAL_MODELS: Final = ("sysid", LAW, ACTUATOR, SIMFREE, "resphys")  # with prediction intervals, beside the baselines
+# With prediction intervals, beside the baselines.
+INTERVAL_MODELS: Final = ("sysid", LAW, ACTUATOR, SIMFREE, "resphys")
 LEARNED: Final = (SIMFREE, "resphys_uncorrected", "resphys")
-# By model: the simulator that it uses or corrects, and the identification that provides its parameters.
+# By model: the simulator that it uses or corrects, and the identification that provides its
+# parameters.
 MODELS: Final[Mapping[str, tuple[str, str | None]]] = {
     "published": ("published", None),
     "simulation": ("simulation", None),
@@ -72,7 +74,10 @@ def read_actuator(folder: Path) -> dict[str, InputNetwork]:
 
 
 def training_files(folder: Path, run: RunSettings) -> dict[str, Path]:
-    """Files with the epochs of what a run learned and the weights that were kept, by model; some may be missing."""
+    """Files with the epochs of what a run learned and the weights that were kept, by model.
+
+    Some may be missing.
+    """
     files = {ACTUATOR: folder / ACTUATOR_FILE} if run.with_actuator else {}
     forces = () if run.reconstruction is None else LEARNED
     return {**files, **{model: folder / training_file(model) for model in forces}}
@@ -114,14 +119,16 @@ class Experiment:
         """Returns a simulator with the gravity of the trials.
 
         Args:
-            kind: ``simulation`` (uncorrected), ``target`` (which generated the trials), ``published``,
-                ``identified``, which may use another integrator and a shorter time step, or ``law``, which has an
-                identified material as well.
+            kind: ``simulation`` (uncorrected), ``target`` (which generated the trials),
+                ``published``, ``identified``, which may use another integrator and a shorter time
+                step, or ``law``, which has an identified material as well.
         """
         if kind not in self._simulators:
             body = None if kind in ("published", "target") else self.body
             made_of, material = self.settings_of(kind), self.material_of(kind)
-            self._simulators[kind] = build_simulator(made_of, material, body, on_failure=self.on_failure)
+            self._simulators[kind] = build_simulator(
+                made_of, material, body, on_failure=self.on_failure
+            )
         return self._simulators[kind]
 
     def settings_of(self, kind: str) -> SimulatorSettings:
@@ -132,9 +139,20 @@ class Experiment:
             published = settings.published
             assert published is not None
             changes |= {"physics": published.physics, "integrator": published.integrator}
-        elif kind in ("identified", LAW) and identified is not None and identified.integrator is not None:
-            changes |= {"integrator": identified.integrator, "time_step": settings.time_step / identified.substeps}
-        chosen = target_settings(settings, settings.target) if kind == "target" else SimulatorSettings.of(settings)
+        elif (
+            kind in ("identified", LAW)
+            and identified is not None
+            and identified.integrator is not None
+        ):
+            changes |= {
+                "integrator": identified.integrator,
+                "time_step": settings.time_step / identified.substeps,
+            }
+        chosen = (
+            target_settings(settings, settings.target)
+            if kind == "target"
+            else SimulatorSettings.of(settings)
+        )
         return chosen.model_copy(update=changes)
 
     def material_of(self, kind: str) -> MaterialSettings:
@@ -161,9 +179,13 @@ class Experiment:
             markers = settings.markers
             assert markers is not None
             bound = bound_markers(markers, self.body.mesh, trials.bound, trials.labels)
-            observe = ViewedMarkers.of(bound, marker_view_of(markers, trials.labels, trials.sets)).to(self.like)
+            observe = ViewedMarkers.of(
+                bound, marker_view_of(markers, trials.labels, trials.sets)
+            ).to(self.like)
         sensors = {name: force_sensor(settings.sensors[name]) for name in trials.loads}
-        more: dict[str, Any] = {"actuation": settings.actuation} if "actuation" in settings.reads else {}
+        more: dict[str, Any] = (
+            {"actuation": settings.actuation} if "actuation" in settings.reads else {}
+        )
         return ObservedMotions(
             *(trials, observe, settings.release, settings.payload_at),
             train_fraction=settings.train_fraction,
@@ -172,16 +194,25 @@ class Experiment:
         )
 
     def identified(self, model: str) -> Identification:
-        """Returns what was identified of a model's simulator, with the learned actuator if the model uses it."""
+        """Returns what was identified of a model's simulator,
+        with the learned actuator if the model uses it.
+        """
         found = self._parameters_of(model)
         if model not in (ACTUATOR, "resphys") or not self.has_actuator:
             return found
-        return replace(found, actuator=self._actuator, test=read_json(self.folder / ACTUATOR_FILE)["kept"]["test"])
+        return replace(
+            found,
+            actuator=self._actuator,
+            test=read_json(self.folder / ACTUATOR_FILE)["kept"]["test"],
+        )
 
     @cached_property
     def _actuator(self) -> dict[str, InputNetwork]:
         """Networks of the learned actuator, by input."""
-        return {name: network.to(self.like.device) for name, network in read_actuator(self.folder).items()}
+        return {
+            name: network.to(self.like.device)
+            for name, network in read_actuator(self.folder).items()
+        }
 
     def _parameters_of(self, model: str) -> Identification:
         """Parameters of a model's simulator, their uncertainty and marker places; or none."""
@@ -191,19 +222,32 @@ class Experiment:
         identified = Identification.read(self.folder / IDENTIFICATION)
         if key != LAW:
             return identified[key]
-        sysid, parameters = identified.get("sysid", Identification()), read_json(self.folder / LAW_FILE)["others"]
-        of_trials = {name: value for name, value in sysid.of_trials.items() if split_name(name)[0] in parameters}
+        sysid = identified.get("sysid", Identification())
+        parameters = read_json(self.folder / LAW_FILE)["others"]
+        of_trials = {
+            name: value
+            for name, value in sysid.of_trials.items()
+            if split_name(name)[0] in parameters
+        }
         return Identification(parameters, of_trials, sysid.placement, sysid.first_frames)
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:
-        """(1,) identified parameters of a model's simulator, by name, and those of trials; empty without any."""
+        """(1,) identified parameters of a model's simulator, by name, and those of trials.
+
+        Empty without any.
+        """
         return self.identified(model).values(self.simulator("simulation"))
 
     @property
     def models(self) -> list[str]:
-        """Names of the models that are compared; law and actuator are among them if they help on held-out trials."""
+        """Names of the models that are compared.
+
+        Law and actuator are among them if they help on held-out trials.
+        """
         settings, found = self.settings, (self.has_law, self.has_actuator, self.has_forces)
-        return models_of(settings.published, settings.identify, settings.correct_uncorrected, *found)
+        return models_of(
+            settings.published, settings.identify, settings.correct_uncorrected, *found
+        )
 
     @property
     def has_forces(self) -> bool:
@@ -213,7 +257,9 @@ class Experiment:
     @property
     def has_law(self) -> bool:
         """Whether a law was identified, and helps on the validation trials."""
-        return self.settings.with_law and bool(read_if_there(self.folder / LAW_FILE).get("accepted"))
+        return self.settings.with_law and bool(
+            read_if_there(self.folder / LAW_FILE).get("accepted")
+        )
 
     @property
     def has_actuator(self) -> bool:
@@ -228,23 +274,33 @@ class Experiment:
     def model_simulator(self, model: str) -> Simulator:
         """The simulator that a model uses or corrects."""
         kind = self.sources(model)[0]
-        return self.simulator("simulation" if kind == "identified" and self.settings.identify is None else kind)
+        return self.simulator(
+            "simulation" if kind == "identified" and self.settings.identify is None else kind
+        )
 
     def model(self, name: str) -> Model:
         """Returns a model that is compared, with what this run has learned for it."""
         learned = self.learned(name)
-        return Model(self.model_simulator(name), self.identified(name), learned, name in INTERVAL_MODELS)
+        return Model(
+            self.model_simulator(name), self.identified(name), learned, name in INTERVAL_MODELS
+        )
 
     def learned(self, model: str) -> Learned | None:
-        """Trained network of a model; None for models without one, and for a force that is no clear gain.
+        """Trained network of a model.
+
+        None for models without one, and for a force that is no clear gain.
 
         Raises:
             DataFileError: the file is missing or damaged.
         """
         if model not in LEARNED or not self.has_forces:
             return None
-        learned = Learned.read(self.folder / weights_file(model), network_of(model), self.like.device)
-        refused = learned.test is not None and not learned.test["used"] and not learned.replaces_simulator
+        learned = Learned.read(
+            self.folder / weights_file(model), network_of(model), self.like.device
+        )
+        refused = (
+            learned.test is not None and not learned.test["used"] and not learned.replaces_simulator
+        )
         return None if refused else learned
 
     def reconstructed(self, model: str) -> ReconstructedTrials | None:

@@ -26,7 +26,9 @@ Stages = Callable[[Workers], list[Stage]]
 
 
 def workers_for(parallel: ParallelSettings, wanted: int | None, device: str) -> Workers:
-    """Returns the wanted number of workers; by default one per core on the CPU, and a single one on a GPU.
+    """Returns the wanted number of workers.
+
+    By default one per core on the CPU, and a single one on a GPU.
 
     Args:
         parallel: parallel settings of the run.
@@ -38,7 +40,9 @@ def workers_for(parallel: ParallelSettings, wanted: int | None, device: str) -> 
     """
     on_cpu = simulation_device(device).type == "cpu"
     if parallel.address is not None and wanted is None:
-        raise InputError("parallel.processes is null: set the number of workers of the Dask cluster.")
+        raise InputError(
+            "parallel.processes is null: set the number of workers of the Dask cluster."
+        )
     if wanted is None:
         wanted = available_cores() if on_cpu else 1
     return Workers(wanted, parallel.address)
@@ -60,7 +64,9 @@ class Fold:
 
 
 def run_folds(folds: Mapping[str, Fold], workers: Workers) -> None:
-    """Runs the folds that are not up to date, one per worker; a single remaining fold uses all workers.
+    """Runs the folds that are not up to date, one per worker.
+
+    A single remaining fold uses all workers.
 
     The results do not depend on the number of workers.
 
@@ -91,8 +97,8 @@ def run_folds(folds: Mapping[str, Fold], workers: Workers) -> None:
             fan_out(_run, left, workers.at_most(len(left)), folder, finished)
     except KeyboardInterrupt as error:
         raise StageInterrupted(
-            f"interrupted before the folds {', '.join(sorted(running))} ended; all saved results are kept, and the "
-            "same command resumes there"
+            f"interrupted before the folds {', '.join(sorted(running))} ended; all saved results "
+            "are kept, and the same command resumes there"
         ) from error
 
 
@@ -106,21 +112,29 @@ def _run(fold: Fold) -> None:
 
 
 def intervals_of_folds(folder: Path, folders: Mapping[str, Path]) -> IntervalTable:
-    """Prediction intervals of a cross-validation; each fold is calibrated on the test trials of the other folds.
+    """Prediction intervals of a cross-validation.
+
+    Each fold is calibrated on the test trials of the other folds.
 
     Args:
         folder: of the dataset.
         folders: folders of the folds, by the trial that a fold leaves out.
     """
     data, names, models = Trials.read(folder / DATASET), list(folders), dict[str, ModelIntervals]()
-    for model in (*BASELINES, *INTERVAL_MODELS) if data.bound is not None and len(names) > 2 else ():
+    for model in (
+        (*BASELINES, *INTERVAL_MODELS) if data.bound is not None and len(names) > 2 else ()
+    ):
         series: dict[str, list[FloatArray]] = {"observed": [], "spread": []}
         for fold in folders.values():
             with read_hdf5(fold / ROLLOUTS, "rollouts") as file:
                 for key, rows in series.items():
-                    rows += [read_array(file, f"{model}_{key}")[0]] if f"{model}_{key}" in file else []
+                    rows += (
+                        [read_array(file, f"{model}_{key}")[0]] if f"{model}_{key}" in file else []
+                    )
         if len(series["observed"]) == len(names):
             spreads = series["spread"] if len(series["spread"]) == len(names) else None
-            if (covered := intervals_of_each_other(data, names, series["observed"], spreads)) is not None:
+            if (
+                covered := intervals_of_each_other(data, names, series["observed"], spreads)
+            ) is not None:
                 models[model] = covered
     return {"level": LEVEL, "calibrated_on": "folds", "models": models}

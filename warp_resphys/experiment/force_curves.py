@@ -31,7 +31,11 @@ def force_curves(
     if not trials.loads or trials.times.shape[1] < 2 or not trials.moving(names):
         return found
     with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
-        shown = {model: read_array(file, f"{model}_loads") for model in models if f"{model}_loads" in file}
+        shown = {
+            model: read_array(file, f"{model}_loads")
+            for model in models
+            if f"{model}_loads" in file
+        }
     for number, (name, readings) in enumerate(trials.loads.items()):
         sensor = force_sensor(run.sensors[name])
         measured = np.where([axis in sensor.axes for axis in AXES], readings[rows], np.nan)
@@ -45,7 +49,10 @@ def force_curves(
         if known and (sensor.zero or sensor.drift):
             last = torch.from_numpy(known[next(reversed(known))][row])
             pair = torch.from_numpy(measured[row])[None], torch.from_numpy(times)[None]
-            error = sensor.deviations[axis] * sensor.errors(last[None, None], *pair)[0, 0, :, axis].numpy()
+            error = (
+                sensor.deviations[axis]
+                * sensor.errors(last[None, None], *pair)[0, 0, :, axis].numpy()
+            )
             off = read - (last[:, axis].numpy() - error)
         curves = {model: values[row, :, axis] for model, values in known.items()}
         found[name] = ForceCurve(names[row], AXES[axis], sensor.unit, times, read - off, curves)

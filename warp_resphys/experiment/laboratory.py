@@ -1,8 +1,10 @@
-"""Stage: simulated laboratory, which records trials of a simulation that takes the place of the real body.
+"""Stage: simulated laboratory, which records trials of a simulation
+that takes the place of the real body.
 
-The laboratory is for users without one. Its simulation is a target (`experiment.simulate`): mesh, time step, material
-and actuators may differ from those of the simulator to be corrected. Its body is slightly tilted, its markers deviate
-slightly from their nominal places, and cameras see the markers in their own frame, with noise.
+The laboratory is for users without one. Its simulation is a target (`experiment.simulate`): mesh,
+time step, material and actuators may differ from those of the simulator to be corrected. Its body
+is slightly tilted, its markers deviate slightly from their nominal places, and cameras see the
+markers in their own frame, with noise.
 """
 
 import zlib
@@ -72,7 +74,9 @@ class Setup:
             positions: (T, M, 3) observed points in the frame of the body [m].
             base: (T, 6) motion of the base, with which the reference markers move.
         """
-        return self.frame.apply(np.concatenate([positions, rigid(base).apply(self.reference)], axis=1))
+        return self.frame.apply(
+            np.concatenate([positions, rigid(base).apply(self.reference)], axis=1)
+        )
 
 
 def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
@@ -99,18 +103,26 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
             assert laboratory.seconds is not None
             frames = max(int(laboratory.seconds / laboratory.time_step) + 1, 2) + 1
         for first, some in cut(names, settings.batch):
-            cut_up.append(TrialPart(f"{begins}_{first:03d}", some, frames, partial(_played, settings, some, frames)))
+            cut_up.append(
+                TrialPart(
+                    f"{begins}_{first:03d}", some, frames, partial(_played, settings, some, frames)
+                )
+            )
     parts = Parts.of(context, workers)
     parts.run(cut_up)
     setup = make_setup(settings)
     seen = {
         name: row
         for part in cut_up
-        for name, *row in zip(part.names, *(parts.read(part, key) for key in ("markers", "loads")), strict=True)
+        for name, *row in zip(
+            part.names, *(parts.read(part, key) for key in ("markers", "loads")), strict=True
+        )
     }
     noise = [_record(context, setup, trial, *seen[trial.name]) for trial in trials]
     if all(trial.scale == 1.0 for trial in trials):
-        material, fibres, muscles = (getattr(laboratory, key) for key in ("material", "fibres", "muscles"))
+        material, fibres, muscles = (
+            getattr(laboratory, key) for key in ("material", "fibres", "muscles")
+        )
         wound = {} if fibres is None else {"fibre_stiffness": fibres.stiffness}
         wound |= {} if muscles is None else {"muscle_stiffness": muscles.stiffness}
         released = {trial.name: _drawn(settings, trial)[1] for trial in trials}
@@ -130,8 +142,13 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
     parts.remove()
 
 
-def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArray, loads: FloatArray) -> float:
-    """Writes the recording of a trial; returns the mean distance by which noise moves its tracked markers [m]."""
+def _record(
+    context: StageContext, setup: Setup, trial: Trial, series: FloatArray, loads: FloatArray
+) -> float:
+    """Writes the recording of a trial.
+
+    Returns the mean distance by which noise moves its tracked markers [m].
+    """
     settings: StageSettings = context.settings
     laboratory, data = settings.laboratory, settings.data
     draw, released = _drawn(settings, trial)
@@ -152,12 +169,16 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
     for corners in corners_of(settings.binding.observed).values():
         turns = np.radians(laboratory.orientation_noise) * draw.standard_normal((len(positions), 3))
         spoke = positions[:, corners] - positions[:, corners].mean(axis=1, keepdims=True)
-        noise[:, corners] = noise[:, corners][:, :1] + spoke @ Rotation.from_rotvec(-turns).as_matrix() - spoke
+        noise[:, corners] = (
+            noise[:, corners][:, :1] + spoke @ Rotation.from_rotvec(-turns).as_matrix() - spoke
+        )
     labels = [*settings.binding.observed, *settings.binding.reference]
     for name in [name for name, motion in data.obstacle_motion.items() if motion == "recorded"]:
         way = pushing[name][0] if name in pushing else still
         arms = ["", *(f" +{axis}" for axis in "xyz")][: 4 if way[:, 3:].any() else 1]
-        places = np.asarray(laboratory.obstacles[name].position) + ARM * np.eye(4, 3, -1)[: len(arms)]
+        places = (
+            np.asarray(laboratory.obstacles[name].position) + ARM * np.eye(4, 3, -1)[: len(arms)]
+        )
         seen = setup.frame.apply(rigid(way).apply(places))
         labels += [f"{name}{arm}" for arm in arms]
         positions = np.concatenate([positions, seen], axis=1)
@@ -171,7 +192,9 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
     rest = None if trial.pull is None else setup.recorded(setup.tracked[None], still[:1])[0]
     motion = in_frame(poses, setup.frame) if data.base_motion == "recorded" else None
     path = context.run_dir / trial.recording
-    recording = Recording(tuple(labels), positions + noise, rate, path, actuation=actuation, rest=rest, base=motion)
+    recording = Recording(
+        tuple(labels), positions + noise, rate, path, actuation=actuation, rest=rest, base=motion
+    )
     recording = replace(recording, loads=_measured(settings, trial, loads, rate))
     lengths = {name: body.length for name, body in settings.binding.rigid_bodies.items()}
     write_recording(path, with_axes(recording, lengths), {"payload_kg": trial.payload})
@@ -179,21 +202,33 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
     return float(np.linalg.norm(moved, axis=-1).mean())
 
 
-def _measured(settings: StageSettings, trial: Trial, loads: FloatArray, rate: float) -> dict[str, FloatArray]:
-    """Readings (T, 6) of force sensors [N, N m] with noise, zero and drift, of the axes that they measure."""
-    draw, measured = np.random.default_rng([settings.seed, 3, zlib.crc32(trial.name.encode())]), dict[str, FloatArray]()
+def _measured(
+    settings: StageSettings, trial: Trial, loads: FloatArray, rate: float
+) -> dict[str, FloatArray]:
+    """Readings (T, 6) of force sensors [N, N m] with noise,
+    zero and drift, of the axes that they measure.
+    """
+    draw = np.random.default_rng([settings.seed, 3, zlib.crc32(trial.name.encode())])
+    measured = dict[str, FloatArray]()
     times = np.arange(len(loads))[:, None] / rate
     for number, (name, one) in enumerate(settings.sensors.items()):
         sensor = force_sensor(one)
         off = draw.standard_normal(loads[:, number].shape)
-        off += sensor.zero * draw.standard_normal(6) + sensor.drift * times * draw.standard_normal(6)
+        off += sensor.zero * draw.standard_normal(6) + sensor.drift * times * draw.standard_normal(
+            6
+        )
         seen = [axis in sensor.axes for axis in AXES]
-        measured[name] = np.where(seen, loads[:, number] + np.where(seen, sensor.deviations, 0.0) * off, np.nan)
+        measured[name] = np.where(
+            seen, loads[:, number] + np.where(seen, sensor.deviations, 0.0) * off, np.nan
+        )
     return measured
 
 
 def _drawn(settings: StageSettings, trial: Trial) -> tuple[np.random.Generator, float | None]:
-    """Random numbers of a trial, and when its body is released, between two frames [s]; None if it is not held."""
+    """Random numbers of a trial, and when its body is released, between two frames [s].
+
+    None if it is not held.
+    """
     draw = np.random.default_rng([settings.seed, zlib.crc32(trial.name.encode())])
     if trial.begins != "held":
         return draw, None
@@ -204,7 +239,10 @@ def _drawn(settings: StageSettings, trial: Trial) -> tuple[np.random.Generator, 
 def _zero_of(settings: StageSettings, trial: Trial) -> float:
     """Recorded value of a trial's inputs where nothing acts."""
     draw = np.random.default_rng([settings.seed, 2, zlib.crc32(trial.name.encode())])
-    return float(settings.laboratory.zero_noise * np.clip(draw.standard_normal(), -_FURTHEST_ZERO, _FURTHEST_ZERO))
+    return float(
+        settings.laboratory.zero_noise
+        * np.clip(draw.standard_normal(), -_FURTHEST_ZERO, _FURTHEST_ZERO)
+    )
 
 
 def _rate_of(settings: StageSettings) -> float:
@@ -213,10 +251,12 @@ def _rate_of(settings: StageSettings) -> float:
 
 
 def make_setup(settings: StageSettings) -> Setup:
-    """Draws the pose of the body, the places of its markers and the mountings of its rigid bodies from the seed.
+    """Draws the pose of the body, the places of its markers
+    and the mountings of its rigid bodies from the seed.
 
-    The vertical of the recordings is ``data.up``, as with levelled cameras, and the body is tilted by
-    ``laboratory.tilt``. If ``data.up`` is null, the body is not tilted and the frame of the recordings is arbitrary.
+    The vertical of the recordings is ``data.up``, as with levelled cameras, and the body is tilted
+    by ``laboratory.tilt``. If ``data.up`` is null, the body is not tilted and the frame of the
+    recordings is arbitrary.
     """
     laboratory, binding = settings.laboratory, settings.binding
     draw = np.random.default_rng([settings.seed, 0])
@@ -241,12 +281,18 @@ def make_setup(settings: StageSettings) -> Setup:
         moved = centre + draw.uniform(-_LARGEST_MOUNTING, _LARGEST_MOUNTING, 3)
         observed[corners] = moved + mounting.apply(observed[corners] - centre)
     observed[:count] = places[:count]
-    return Setup(gravity, RigidTransform(rotation.as_matrix(), translation), observed, places[count:])
+    return Setup(
+        gravity, RigidTransform(rotation.as_matrix(), translation), observed, places[count:]
+    )
 
 
 def laboratory_simulator(settings: StageSettings, gravity: FloatArray) -> Simulator:
-    """Simulator that takes the place of the real body, for gravity in the frame of the body [m/s^2]."""
-    simulated = target_settings(settings, settings.laboratory).model_copy(update={"gravity": tuple(gravity.tolist())})
+    """Simulator that takes the place of the real body,
+    for gravity in the frame of the body [m/s^2].
+    """
+    simulated = target_settings(settings, settings.laboratory).model_copy(
+        update={"gravity": tuple(gravity.tolist())}
+    )
     return build_simulator(simulated, settings.laboratory.material)
 
 
@@ -262,19 +308,24 @@ def check_laboratory(run: RunSettings, trials: Sequence[Trial]) -> None:
     for trial in trials:
         if trial.pull is not None and data.rest != "file":
             raise InputError(
-                f"laboratory.trials.{trial.name}.pull deforms the body before its release: set data.rest to file, so "
-                "that the recordings have the markers on the undeformed body."
+                f"laboratory.trials.{trial.name}.pull deforms the body before its release: set "
+                "data.rest to file, so that the recordings have the markers "
+                "on the undeformed body."
             )
-    if data.rest == "file" and any(trial.pull is None and trial.begins == "held" for trial in trials):
-        raise InputError("data.rest is file, but the simulated bodies are held undeformed: set it to held.")
+    if data.rest == "file" and any(
+        trial.pull is None and trial.begins == "held" for trial in trials
+    ):
+        raise InputError(
+            "data.rest is file, but the simulated bodies are held undeformed: set it to held."
+        )
     if begins & {"held", "released"}:
         for key in ("seconds", "held_seconds"):
             if getattr(laboratory, key) is None:
                 raise InputError(f"laboratory.{key} is missing: released trials need it.")
         if (laboratory.seconds or 0.0) < (data.seconds or 0.0):
             raise InputError(
-                f"laboratory.seconds is {laboratory.seconds}, less than data.seconds ({data.seconds}): record at "
-                "least as long as the data are used."
+                f"laboratory.seconds is {laboratory.seconds}, less than data.seconds "
+                f"({data.seconds}): record at least as long as the data are used."
             )
     _check_waves(laboratory, trials)
     if begins & {*RESTING}:
@@ -285,33 +336,43 @@ def check_laboratory(run: RunSettings, trials: Sequence[Trial]) -> None:
 
 
 def _check_waves(laboratory: LaboratorySettings, trials: Sequence[Trial]) -> None:
-    """Refuses waves of bodies without inputs, of trials without motion, and of other parts than those of the body."""
+    """Refuses waves of bodies without inputs, of trials without motion,
+    and of other parts than those of the body.
+    """
     quantity = driving_quantity(laboratory)
     for trial in trials:
         if trial.waves is None:
             continue
         key = f"laboratory.trials.{trial.name}.waves"
         if quantity is None or trial.begins not in RESTING:
-            why = "the body has no inputs" if quantity is None else f"the trial begins {trial.begins}"
+            why = (
+                "the body has no inputs" if quantity is None else f"the trial begins {trial.begins}"
+            )
             raise InputError(f"{key} is set, but {why}: leave it out.")
         count, parts = len(trial.waves.phases), driven_parts(laboratory)
         if count != parts:
             wanted = number_of(parts, quantity.per)
-            raise InputError(f"{key}.phases has {count} values, but the body has {wanted}: give as many phases.")
+            raise InputError(
+                f"{key}.phases has {count} values, but the body has {wanted}: give as many phases."
+            )
     without = [trial.name for trial in trials if trial.begins in RESTING and not trial.is_driven]
     if without and any(trial.waves is not None for trial in trials):
-        raise InputError(f"laboratory.trials.{without[0]}.waves is missing, which other trials have: add it.")
+        raise InputError(
+            f"laboratory.trials.{without[0]}.waves is missing, which other trials have: add it."
+        )
 
 
 def _inputs_of(settings: StageSettings, trial: Trial) -> FloatArray:
-    """(K + 1, C) inputs of a trial at the frames: its waves, or drawn from the seed and the number of its sequence.
+    """(K + 1, C) inputs of a trial at the frames: its waves,
+    or drawn from the seed and the number of its sequence.
 
     They are small enough that recorded ones stay within the limit of inputs with any zero.
     """
     draw = np.random.default_rng([settings.seed, 1, trial.sequence or 0])
     data, laboratory = settings.data, settings.laboratory
     assert data.steps is not None
-    before = data.steps if trial.begins == UNDER_INPUTS else 0  # whose end finds the body under inputs
+    # Whose end finds the body under inputs.
+    before = data.steps if trial.begins == UNDER_INPUTS else 0
     steps, parts = before + data.steps, driven_parts(laboratory)
     limit = data.input_limit - _FURTHEST_ZERO * laboratory.zero_noise
     if trial.waves is not None:
@@ -327,17 +388,20 @@ def _inputs_of(settings: StageSettings, trial: Trial) -> FloatArray:
 
 
 def _played(settings: StageSettings, names: Sequence[str], frames: int, report: Report) -> Arrays:
-    """Tracked markers of bodies in the laboratory in the frame of the body: released, driven, or in a static pose.
+    """Tracked markers of bodies in the laboratory in the frame of the body:
+    released, driven, or in a static pose.
 
-    At every step of released bodies, from time zero on, and at the frames of driven bodies, whose inputs are
-    interpolated linearly.
+    At every step of released bodies, from time zero on, and at the frames of driven bodies, whose
+    inputs are interpolated linearly.
     """
     setup, binding = make_setup(settings), settings.binding
     simulator = laboratory_simulator(settings, setup.gravity)
     by_name = {trial.name: trial for trial in settings.trials}
     trials = [by_name[name] for name in names]
     begins, released = trials[0].begins, trials[0].is_released
-    markers = bound_markers(binding, simulator.body.mesh, setup.tracked, binding.observed).to(simulator.rest_positions)
+    markers = bound_markers(binding, simulator.body.mesh, setup.tracked, binding.observed).to(
+        simulator.rest_positions
+    )
     payload = np.array([trial.payload for trial in trials])
     hung = payload_inputs(simulator.body, settings.payload_at, payload) if payload.any() else {}
     weights = Inputs(**{key: simulator.tensor(masses) for key, masses in hung.items()})
@@ -353,7 +417,9 @@ def _played(settings: StageSettings, names: Sequence[str], frames: int, report: 
         return weights.replace(**{quantity.name: values})
 
     if not released:
-        begin = simulator.static_equilibrium(inputs_at(0, 0.0), simulator.prepare(), batch=len(trials))
+        begin = simulator.static_equilibrium(
+            inputs_at(0, 0.0), simulator.prepare(), batch=len(trials)
+        )
     elif any(trial.pull for trial in trials):
         pulls = simulator.tensor([trial.pull or (0.0, 0.0, 0.0) for trial in trials])
         force = distributed(simulator, vertices_at(simulator.body.mesh, settings.tip), pulls)
@@ -363,16 +429,25 @@ def _played(settings: StageSettings, names: Sequence[str], frames: int, report: 
         begin = simulator.rest_state(len(trials))
     substeps = 1
     if not released:
-        substeps = 0 if begins == STATIC else substeps_of(settings.time_step, settings.laboratory, "laboratory")
+        substeps = (
+            0
+            if begins == STATIC
+            else substeps_of(settings.time_step, settings.laboratory, "laboratory")
+        )
     sensors = [force_sensor(sensor) for sensor in settings.sensors.values()]
     unread = begin.q.new_full((len(trials), len(sensors), 6), torch.nan)
     if not released:
         unread = readings(simulator, sensors, begin, None, inputs_at(0, 0.0), simulator.prepare())
-    begin, seen, loads = begin.with_memory({"loads": unread}, LOADS), list[torch.Tensor](), list[torch.Tensor]()
+    begin = begin.with_memory({"loads": unread}, LOADS)
+    seen = list[torch.Tensor]()
+    loads = list[torch.Tensor]()
     read = partial(readings, simulator, sensors) if sensors else None
     for state in played(frames, simulator, substeps, settings.data, trials, begin, inputs_at, read):
         seen.append(markers(state.q))
         loads.append(state.memory_of(LOADS).get("loads", unread))
         report()
     series = {"markers": (seen, "m"), "loads": (loads, "N, N m")}
-    return {name: (torch.stack(values, 1).cpu().numpy(), unit) for name, (values, unit) in series.items()}
+    return {
+        name: (torch.stack(values, 1).cpu().numpy(), unit)
+        for name, (values, unit) in series.items()
+    }

@@ -40,9 +40,10 @@ from .files import (
 def identify(context: StageContext) -> None:
     """Writes identification.json: all configured parameters, and optionally E and nu alone.
 
-    E and nu alone are identified with the integrator of the uncorrected simulator, as published; all parameters with
-    the identified simulator. ``identify.trials`` and ``identify.seconds`` restrict the number and length of the
-    training trials. An interrupted run keeps its finished searches.
+    E and nu alone are identified with the integrator of the uncorrected simulator, as published;
+    all parameters with the identified simulator. ``identify.trials`` and ``identify.seconds``
+    restrict the number and length of the training trials. An interrupted run keeps its finished
+    searches.
 
     Raises:
         InputError: values are estimated from the whole of a test trial.
@@ -50,13 +51,22 @@ def identify(context: StageContext) -> None:
     settings: StageSettings = context.settings
     wanted, names = settings.identify, settings.split.train
     experiment, found = Experiment(settings, context.run_dir), {}
-    kept = {model: context.run_dir / f"identify_{model}_parts.safetensors" for model in ("sysid", "sysid_elastic")}
+    kept = {
+        model: context.run_dir / f"identify_{model}_parts.safetensors"
+        for model in ("sysid", "sysid_elastic")
+    }
     names = names if wanted.trials is None else tuple(evenly(names, wanted.trials))
-    for model, parameters in {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}.items():
+    for model, parameters in {
+        "sysid": wanted.parameters,
+        "sysid_elastic": wanted.elastic or {},
+    }.items():
         if not parameters:
             continue
         result = identification.identify(
-            *(experiment.simulator(MODELS[model][0]), experiment.motions, parameters, wanted.first_guess),
+            experiment.simulator(MODELS[model][0]),
+            experiment.motions,
+            parameters,
+            wanted.first_guess,
             names=names,
             held_out=[name for name in settings.split.names if name not in names],
             accuracy=_accuracy(settings, experiment.trials) if model == "sysid" else None,
@@ -68,7 +78,8 @@ def identify(context: StageContext) -> None:
             seed=settings.seed,
             kept=kept[model],
         )
-        counted(experiment.motions, names, settings.split.test, result.first_frames)  # Raises before any training.
+        # Raises before any training.
+        counted(experiment.motions, names, settings.split.test, result.first_frames)
         found[model] = result.plain()
     write_json(context.run_dir / IDENTIFICATION, found)
     for path in kept.values():
@@ -80,17 +91,25 @@ def _accuracy(settings: StageSettings, trials: Trials) -> Accuracy | None:
     wanted, markers, bound = settings.identify.placement, settings.markers, trials.bound
     if wanted is None or markers is None or bound is None:
         return None
-    turn, mounting = (None if x is None else math.radians(x) for x in (wanted.turn, wanted.mounting))
+    turn, mounting = (
+        None if x is None else math.radians(x) for x in (wanted.turn, wanted.mounting)
+    )
     centre = np.mean([*markers.reference.values()] or [*markers.tracked.values()], axis=0).tolist()
-    bodies = tuple((rows.start, bound[rows] - bound[rows].mean(axis=0)) for rows in corners_of(trials.labels).values())
-    return Accuracy(wanted.markers, wanted.shift, turn, wanted.between_sessions, mounting, bodies, centre)
+    bodies = tuple(
+        (rows.start, bound[rows] - bound[rows].mean(axis=0))
+        for rows in corners_of(trials.labels).values()
+    )
+    return Accuracy(
+        wanted.markers, wanted.shift, turn, wanted.between_sessions, mounting, bodies, centre
+    )
 
 
 def identify_law(context: StageContext) -> None:
     """Writes law.json: the law, its posterior, the classes that were tried, and whether it is used.
 
-    A law of another run stays as it is; the parameters of actuators and of the medium are identified with it.
-    A run that is interrupted keeps the classes of the weak form and the finished searches.
+    A law of another run stays as it is; the parameters of actuators and of the medium are
+    identified with it. A run that is interrupted keeps the classes of the weak form and the
+    finished searches.
 
     Raises:
         DataFileError: the file of the law is missing, damaged or of another version.
@@ -112,7 +131,10 @@ def identify_law(context: StageContext) -> None:
     )
     content = law.plain()
     if known is None:
-        content["data"], content["versions"] = {"name": settings.name, "trials": law.trials}, package_versions()
+        content["data"], content["versions"] = (
+            {"name": settings.name, "trials": law.trials},
+            package_versions(),
+        )
     else:
         accepted = known.get("accepted_there", known.get("accepted", True))
         content = {**known, **content, "accepted_there": accepted, "file": file}
@@ -121,7 +143,8 @@ def identify_law(context: StageContext) -> None:
 
 
 def train_actuator(context: StageContext) -> None:
-    """Writes actuator.json: the networks that change inputs, their test on held-out trials, and the epochs.
+    """Writes actuator.json: the networks that change inputs,
+    their test on held-out trials, and the epochs.
 
     An interrupted training resumes; a cross-validation before it (`left_out_in_turn`) is repeated.
     """
@@ -143,7 +166,9 @@ def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
     The summary has the distance between reconstructed and observed points.
     """
     settings: StageSettings = context.settings
-    experiment, model, folder = Experiment(settings, context.run_dir), settings.model, context.run_dir
+    experiment = Experiment(settings, context.run_dir)
+    model = settings.model
+    folder = context.run_dir
     parts = Parts.of(context, workers, settings.batch)
     found = reconstruction.reconstruct(
         experiment.model_simulator(model),
@@ -154,8 +179,11 @@ def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
         acts=settings.network.acts,
         parts=parts,
     )
-    with atomic_hdf5(folder / reconstruction_file(model), "reconstruction", {"names": [*found.names]}) as file:
-        for name, unit in reconstruction.UNITS.items():  # One array at a time, as many trials take much memory.
+    with atomic_hdf5(
+        folder / reconstruction_file(model), "reconstruction", {"names": [*found.names]}
+    ) as file:
+        # One array at a time, as many trials take much memory.
+        for name, unit in reconstruction.UNITS.items():
             create(file, name, found.read(name), unit, time_axis=1)
     errors = found.read("error")
     summary = {"mean_mm": float(np.nanmean(errors)), "max_mm": float(np.nanmax(errors))}
@@ -164,21 +192,29 @@ def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
 
 
 def train(context: StageContext) -> None:
-    """Trains a model; writes <model>.safetensors, with the selected weights, and training_<model>.json.
+    """Trains a model.
+
+    Writes <model>.safetensors, with the selected weights, and training_<model>.json.
 
     An interrupted training resumes.
     """
     settings: StageSettings = context.settings
     model, folder, name = settings.model, context.run_dir, context.name
     checkpoint, resumed, save = _kept_training(context)
-    learned = fit(fitting_of(Experiment(settings, folder), model), settings.training, name, resumed, save)
+    learned = fit(
+        fitting_of(Experiment(settings, folder), model), settings.training, name, resumed, save
+    )
     write_json(folder / training_file(model), learned.training)
     learned.write(folder / weights_file(model), context.fingerprint)
     checkpoint.unlink(missing_ok=True)
 
 
-def _kept_training(context: StageContext) -> tuple[Path, Snapshot | None, Callable[[Snapshot], None]]:
-    """Returns the file of an interrupted training of a stage, its last snapshot or None, and what saves others."""
+def _kept_training(
+    context: StageContext,
+) -> tuple[Path, Snapshot | None, Callable[[Snapshot], None]]:
+    """Returns the file of an interrupted training of a stage,
+    its last snapshot or None, and what saves others.
+    """
     path = context.run_dir / f"{context.name}.safetensors"
 
     def save(kept: Snapshot) -> None:
@@ -206,10 +242,15 @@ def fitting_of(experiment: Experiment, model: str) -> Fitting:
 
 
 def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
-    """Writes rollouts.h5, the observed points of every model's roll-outs of the test trials, and errors.json."""
+    """Writes rollouts.h5, the observed points of every model's roll-outs
+    of the test trials, and errors.json.
+    """
     settings: StageSettings = context.settings
-    experiment, parts = Experiment(settings, context.run_dir, "count"), Parts.of(context, workers, settings.batch)
-    with_points = experiment.has_forces and experiment.trials.bound is None and not settings.with_law
+    experiment = Experiment(settings, context.run_dir, "count")
+    parts = Parts.of(context, workers, settings.batch)
+    with_points = (
+        experiment.has_forces and experiment.trials.bound is None and not settings.with_law
+    )
     found = experiment.reconstructed("resphys") if with_points else None
     compared = Comparison(
         {name: experiment.model(name) for name in experiment.models},
@@ -222,7 +263,11 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
         parts=parts,
     )
     errors = compared.errors()
-    attributes = {"names": compared.names, "time_step": settings.time_step, "film_trial": compared.filmed}
+    attributes = {
+        "names": compared.names,
+        "time_step": settings.time_step,
+        "film_trial": compared.filmed,
+    }
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
         for model, values in compared.simulated.items():
             create(file, f"{model}_observed", values, "m", time_axis=1)

@@ -30,13 +30,19 @@ from ..report.pages.material_page import (
     write_material_report,
 )
 from ..settings.run import RunSettings
-from ..settings.specimen import MaterialTestData, MaterialTestSettings, MembraneSettings, SimulatedTests
+from ..settings.specimen import (
+    MaterialTestData,
+    MaterialTestSettings,
+    MembraneSettings,
+    SimulatedTests,
+)
 from ..settings.stage_keys import StageSettings
 from .files import LAW_FILE, METRICS, REPORT
 
 RESULTS = "material_tests.json"
 _CURVE, _DOTS = 81, 400  # points of a curve, and of the measured samples, in figures
-_REACH = 2.0  # ratio of the largest strain that is predicted to the largest that the law is identified from
+# Ratio of the largest strain that is predicted to the largest that the law is identified from.
+_REACH = 2.0
 
 
 def material_stages(run: RunSettings, data: MaterialTestData) -> list[Stage]:
@@ -52,7 +58,9 @@ def material_stages(run: RunSettings, data: MaterialTestData) -> list[Stage]:
 
 
 def table_files(data: MaterialTestData) -> dict[str, list[Path]]:
-    """Returns the paths of the tables by test. A pattern leaves out the files that other tests name.
+    """Returns the paths of the tables by test.
+
+    A pattern leaves out the files that other tests name.
 
     Raises:
         DataFileError: one is missing.
@@ -60,27 +68,40 @@ def table_files(data: MaterialTestData) -> dict[str, list[Path]]:
     if data.folder is None:
         return {}
     folder = Path(data.folder).expanduser()
-    single = {name: folder / str(test.file) for name, test in data.tests.items() if (folder / str(test.file)).is_file()}
+    single = {
+        name: folder / str(test.file)
+        for name, test in data.tests.items()
+        if (folder / str(test.file)).is_file()
+    }
     named, found = {path.resolve() for path in single.values()}, dict[str, list[Path]]()
     for name, test in data.tests.items():
         pattern = str(test.file)
         try:
             matches = [] if name in single else sorted(folder.glob(pattern))
-        except (ValueError, NotImplementedError, IndexError):  # no pattern: an absolute path, '.' or 'a**'
+        except (ValueError, NotImplementedError, IndexError):
+            # No pattern: an absolute path, '.' or 'a**'.
             matches = []
         files = [path for path in matches if path.is_file() and path.resolve() not in named]
         if name not in single and not files:
             place = folder / pattern
-            what = f"{place} is a folder, not a file" if place.is_dir() else f"there is no file {place}"
+            what = (
+                f"{place} is a folder, not a file"
+                if place.is_dir()
+                else f"there is no file {place}"
+            )
             raise DataFileError(f"{what}: set data.folder and data.tests.{name}.file.")
         found[name] = files or [single[name]]
     return found
 
 
-def names_of(data: MaterialTestData, tables: Mapping[str, Sequence[Path]]) -> dict[tuple[str, Path], str]:
-    """Returns a name of its own for each table: that of its test, or where a pattern finds several that of the file.
+def names_of(
+    data: MaterialTestData, tables: Mapping[str, Sequence[Path]]
+) -> dict[tuple[str, Path], str]:
+    """Returns a name of its own for each table: that of its test,
+    or where a pattern finds several that of the file.
 
-    Files of one name are named with their folders, and files that differ by their extension with it.
+    Files of one name are named with their folders, and files that differ by their extension with
+    it.
     """
     places = [(name, path) for name, paths in tables.items() for path in paths]
     folder = Path(data.folder or "").expanduser()
@@ -94,7 +115,9 @@ def names_of(data: MaterialTestData, tables: Mapping[str, Sequence[Path]]) -> di
     ]
     names = dict[tuple[str, Path], str]()
     for form in forms:
-        names = {(name, path): form(name, path) if name in several else name for name, path in places}
+        names = {
+            (name, path): form(name, path) if name in several else name for name, path in places
+        }
         if len({*names.values()}) == len(places):
             break
     return names
@@ -103,9 +126,11 @@ def names_of(data: MaterialTestData, tables: Mapping[str, Sequence[Path]]) -> di
 def tests_of(
     data: MaterialTestData, poissons_ratio: float, seed: int
 ) -> tuple[dict[str, MaterialTest], dict[str, MaterialTest], list[str]]:
-    """Returns the tests that the law is identified from, those held out, read or simulated, and what was left out.
+    """Returns the tests that the law is identified from, those held out,
+    read or simulated, and what was left out.
 
-    The samples in ``data.range`` count. A table of several is a test by its name, one of a membrane a test by weight.
+    The samples in ``data.range`` count. A table of several is a test by its name, one of a membrane
+    a test by weight.
 
     Raises:
         DataFileError: a table cannot be read.
@@ -124,7 +149,9 @@ def tests_of(
                     found |= tests
                 else:
                     random = np.random.default_rng((seed, number))
-                    found[called], said = _deformed(path, called, data, wanted, poissons_ratio, random)
+                    found[called], said = _deformed(
+                        path, called, data, wanted, poissons_ratio, random
+                    )
             notes += [f"{called}: {note}" for note in said]
     notes += [f"{name}: {note}" for name, test in (fitted | held).items() for note in test.left_out]
     return fitted, held, notes
@@ -133,7 +160,9 @@ def tests_of(
 def _inflated(
     path: Path, name: str, data: MaterialTestData, wanted: MembraneSettings, poissons_ratio: float
 ) -> tuple[dict[str, MaterialTest], list[str]]:
-    """Returns the tests of a membrane under each weight, with the samples in ``data.range``, and what was left out."""
+    """Returns the tests of a membrane under each weight,
+    with the samples in ``data.range``, and what was left out.
+    """
     table, tests = read_membrane(path), dict[str, MaterialTest]()
     strain = table.height / wanted.radius
     within = _counted(strain, data, name)
@@ -142,7 +171,8 @@ def _inflated(
         chosen = within & rows
         if chosen.sum() < LEAST_SAMPLES:
             raise InputError(
-                f"data.range leaves {chosen.sum()} samples under {called}: give heights that were measured."
+                f"data.range leaves {chosen.sum()} samples under {called}: "
+                "give heights that were measured."
             )
         membrane = Membrane(
             *(wanted.radius, table.thickness, table.cap, force, table.rings),
@@ -159,7 +189,9 @@ def _counted(strain: FloatArray, data: MaterialTestData, name: str) -> BoolArray
     low, high = data.range or (0.0, np.inf)
     counted = (np.abs(strain) >= low) & (np.abs(strain) <= high)
     if counted.sum() < LEAST_SAMPLES:
-        raise InputError(f"data.range leaves {counted.sum()} samples of {name}: give strains that its table has.")
+        raise InputError(
+            f"data.range leaves {counted.sum()} samples of {name}: give strains that its table has."
+        )
     return np.asarray(counted)
 
 
@@ -181,7 +213,10 @@ def _deformed(
         seconds, lines, notes = table.columns.get("time"), table.lines, [*table.notes]
     else:
         assert data.simulated is not None
-        (strain, stress), seconds = _played(wanted.kind, specimen, simulated, data.simulated, random), None
+        (strain, stress), seconds = (
+            _played(wanted.kind, specimen, simulated, data.simulated, random),
+            None,
+        )
     counted = _counted(strain, data, name)
     test = MaterialTest(
         *(wanted.kind, strain, stress, seconds),
@@ -194,8 +229,10 @@ def _deformed(
     return replace(test, zero=wanted.zero * float(np.abs(stress[test.used]).max())), notes
 
 
-def _recorded(path: Path, data: MaterialTestData, specimen: Specimen) -> tuple[FloatArray, FloatArray, MeasuredTable]:
-    """Returns strains and stresses (N,) [Pa] of a specimen, and the table that they are read from."""
+def _recorded(
+    path: Path, data: MaterialTestData, specimen: Specimen
+) -> tuple[FloatArray, FloatArray, MeasuredTable]:
+    """Strains and stresses (N,) [Pa] of a specimen, and the table that they are read from."""
     table = read_measured(path, data.table)
     read = table.columns
     strain = read["strain"] if "strain" in read else read["displacement"] / specimen.length
@@ -205,9 +242,13 @@ def _recorded(path: Path, data: MaterialTestData, specimen: Specimen) -> tuple[F
 
 
 def _played(
-    kind: str, specimen: Specimen, simulated: Specimen | None, played: SimulatedTests, random: np.random.Generator
+    kind: str,
+    specimen: Specimen,
+    simulated: Specimen | None,
+    played: SimulatedTests,
+    random: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns strains (N,) that a machine with some compliance shows, and stresses (N,) with noise."""
+    """Strains (N,) that a machine with some compliance shows, and stresses (N,) with noise."""
     finer = None if simulated is None else replace(simulated, cells=played.cells)
     strain = np.linspace(0.0, played.strain, played.samples + 1)[1:]
     parameters = {"bulk_1": bulk_of(played.material, specimen.poissons_ratio), **played.material}
@@ -230,32 +271,59 @@ def identify_material(context: StageContext) -> None:
     known = None if wanted.file is None else read_law(wanted.file)
     unscaled, factor = None, None
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".* left out", ResphysWarning)  # which report and terminal name
+        # Which report and terminal name.
+        warnings.filterwarnings("ignore", ".* left out", ResphysWarning)
         if data.scaled:
             assert known is not None
             law = scale_to_tests(tests, known, density=density, poissons_ratio=ratio)
-            simple: LawContent = {**known, "parameters": {"c10": 0.5 * shear_modulus(known["parameters"])}}
-            simplest = law if not law.groups else scale_to_tests(tests, simple, density=density, poissons_ratio=ratio)
+            simple: LawContent = {
+                **known,
+                "parameters": {"c10": 0.5 * shear_modulus(known["parameters"])},
+            }
+            simplest = (
+                law
+                if not law.groups
+                else scale_to_tests(tests, simple, density=density, poissons_ratio=ratio)
+            )
             factor = shear_modulus(law.parameters) / shear_modulus(known["parameters"])
-            unscaled = replace(law, columns={name: value / factor for name, value in law.columns.items()})
+            unscaled = replace(
+                law, columns={name: value / factor for name, value in law.columns.items()}
+            )
         else:
             times = np.geomspace(*wanted.relaxation_times, wanted.branches).tolist()
             options = {"density": density, "poissons_ratio": ratio, "times": times, "known": known}
             law = identify_from_tests(tests, terms=wanted.terms, **options)
             simplest = law if not law.groups else identify_from_tests(tests, terms=(), **options)
-    models = {"law": law, "neo_hookean": simplest} | ({} if unscaled is None else {"unscaled": unscaled})
-    results = {name: _result(name, test, models, name in held) for name, test in (tests | held).items()}
+    models = {"law": law, "neo_hookean": simplest} | (
+        {} if unscaled is None else {"unscaled": unscaled}
+    )
+    results = {
+        name: _result(name, test, models, name in held) for name, test in (tests | held).items()
+    }
     content = law.content()
-    content["data"], content["versions"] = {"name": settings.name, "trials": [*tests]}, dict(package_versions())
+    content["data"], content["versions"] = (
+        {"name": settings.name, "trials": [*tests]},
+        dict(package_versions()),
+    )
     write_json(context.run_dir / LAW_FILE, content)
     write_json(
         context.run_dir / RESULTS,
-        {"tests": results, "machines": law.machines, "rates": law.rates, "factor": factor, "left_out": notes},
+        {
+            "tests": results,
+            "machines": law.machines,
+            "rates": law.rates,
+            "factor": factor,
+            "left_out": notes,
+        },
     )
 
 
-def _result(name: str, test: MaterialTest, models: Mapping[str, MeasuredLaw], held_out: bool) -> SpecimenResult:
-    """Returns errors and curves of a test: in the range, and beyond it where the specimen is not simulated."""
+def _result(
+    name: str, test: MaterialTest, models: Mapping[str, MeasuredLaw], held_out: bool
+) -> SpecimenResult:
+    """Returns errors and curves of a test: in the range,
+    and beyond it where the specimen is not simulated.
+    """
     law, inflated = models["law"], test.kind == "bulge"
     size, machine = np.abs(test.strain), law.machines.get(name, {})
     high = float(size[test.used].max())
@@ -265,12 +333,22 @@ def _result(name: str, test: MaterialTest, models: Mapping[str, MeasuredLaw], he
     zero, taut = machine.get("zero", 0.0), test.taut(machine)
     slow = test.specimen is None and not law.is_viscous
     in_time = law.is_viscous and test.specimen is None  # curves at the times of the test
-    shown = taut[seen] if in_time else np.linspace(size.min() if inflated else 0.0, float(taut[seen].max()), _CURVE)
+    shown = (
+        taut[seen]
+        if in_time
+        else np.linspace(size.min() if inflated else 0.0, float(taut[seen].max()), _CURVE)
+    )
     away, curves = dict[str, FloatArray | None](), dict[str, FloatArray | None]()
     for kind, model in models.items():
         try:
-            away[kind] = model.away(name, test) if name in law.machines else test.away(model.columns, {})
-            curves[kind] = model.curve(test, taut)[seen] if in_time else model.curve(replace(test, seconds=None), shown)
+            away[kind] = (
+                model.away(name, test) if name in law.machines else test.away(model.columns, {})
+            )
+            curves[kind] = (
+                model.curve(test, taut)[seen]
+                if in_time
+                else model.curve(replace(test, seconds=None), shown)
+            )
         except ConvergenceError:  # of a law that is too soft for a membrane's load
             away[kind] = curves[kind] = None
     if not inflated:
@@ -279,7 +357,8 @@ def _result(name: str, test: MaterialTest, models: Mapping[str, MeasuredLaw], he
         curves["hooke"] = slope * shown + offset - zero
     parts = {"range": test.used, "beyond": beyond}
     errors = {
-        part: {k: None if x is None else _error(x[rows]) for k, x in away.items()} for part, rows in parts.items()
+        part: {k: None if x is None else _error(x[rows]) for k, x in away.items()}
+        for part, rows in parts.items()
     }
     covered, half = None, None
     if slow:
@@ -308,8 +387,12 @@ def _error(away: FloatArray) -> float | None:
 
 
 def _hooke(test: MaterialTest) -> tuple[float, float]:
-    """Returns slope and zero [Pa] of a straight line with the least relative errors in the samples that count."""
-    strain, stress, weights = test.strain[test.used], test.stress[test.used], test.weights[test.used]
+    """Returns slope and zero [Pa] of a straight line
+    with the least relative errors in the samples that count.
+    """
+    strain = test.strain[test.used]
+    stress = test.stress[test.used]
+    weights = test.weights[test.used]
     columns = np.stack([strain, np.ones_like(strain)], 1)[:, : 2 if test.zero else 1]
     found = np.linalg.lstsq(columns * weights[:, None], stress * weights)[0]
     return float(found[0]), float(found[1]) if len(found) > 1 else 0.0
@@ -319,7 +402,10 @@ def report_material(context: StageContext) -> None:
     """Writes report.html and its figures."""
     run: RunSettings = context.settings
     write_material_report(
-        context.run_dir / REPORT, material_metrics(context.run_dir), run, read_json(context.run_dir / LAW_FILE)
+        context.run_dir / REPORT,
+        material_metrics(context.run_dir),
+        run,
+        read_json(context.run_dir / LAW_FILE),
     )
 
 
@@ -338,4 +424,9 @@ def print_material(run: RunSettings, folder: Path) -> None:
     """Writes metrics.json, and prints the errors and the verdict."""
     metrics, law = material_metrics(folder), read_json(folder / LAW_FILE)
     write_json(folder / METRICS, metrics)
-    show(run.heading, specimen_table(metrics), *material_verdict(metrics, law, run), f"Report: {folder / REPORT}")
+    show(
+        run.heading,
+        specimen_table(metrics),
+        *material_verdict(metrics, law, run),
+        f"Report: {folder / REPORT}",
+    )

@@ -22,14 +22,18 @@ CHECKED_SECONDS, _CHECKED_POSES = 0.5, 3  # that are simulated with a finer mesh
 
 
 def check_mesh(context: StageContext) -> None:
-    """Writes mesh_check.json: change of the simulation of test trials with a finer mesh, see `finer`.
+    """Writes mesh_check.json: change of the simulation of test trials
+    with a finer mesh, see `finer`.
 
-    The trial with the largest motion is simulated for half a second from where its inputs begin; of poses, a few are.
-    The finer mesh uses the parameters that were identified on the original mesh.
+    The trial with the largest motion is simulated for half a second from where its inputs begin; of
+    poses, a few are. The finer mesh uses the parameters that were identified on the original mesh.
     """
     settings: StageSettings = context.settings
     times, parts = settings.mesh_check, settings.parts
-    refined = {name: part.model_copy(update={"mesh": finer(part.mesh, times)}) for name, part in parts.items()}
+    refined = {
+        name: part.model_copy(update={"mesh": finer(part.mesh, times)})
+        for name, part in parts.items()
+    }
     other = settings.model_copy(update={"mesh": finer(settings.mesh, times), "parts": refined})
     model = "simulation" if settings.identify is None else "sysid"
     content: MeshCheck = {"model": model}
@@ -37,8 +41,13 @@ def check_mesh(context: StageContext) -> None:
         experiments = [Experiment(meshed, context.run_dir) for meshed in (settings, other)]
         meshes = [experiment.body.mesh for experiment in experiments]
         if len(meshes[0].vertices) == len(meshes[1].vertices):
-            raise InputError("its cells are given, and quadratic already; compare it with a finer one.")
-        content |= {"cells": [len(mesh.cells) for mesh in meshes], "vertices": [len(m.vertices) for m in meshes]}
+            raise InputError(
+                "its cells are given, and quadratic already; compare it with a finer one."
+            )
+        content |= {
+            "cells": [len(mesh.cells) for mesh in meshes],
+            "vertices": [len(m.vertices) for m in meshes],
+        }
         sizes = amplitudes(experiments[0].trials, settings.groups["1"])
         moving = experiments[0].trials.moving([*sizes])
         names = [max(moving, key=sizes.__getitem__)] if moving else [*sizes][:_CHECKED_POSES]
@@ -50,9 +59,15 @@ def check_mesh(context: StageContext) -> None:
                 if moving:
                     seconds = first_change(experiment.trials, names[0]) + CHECKED_SECONDS
                     replay = replay.changed(trials=replay.trials.first(seconds))
-                points = replay(motions.start(replay, identified), experiment.parameters(model))[0].cpu().numpy()
+                points = (
+                    replay(motions.start(replay, identified), experiment.parameters(model))[0]
+                    .cpu()
+                    .numpy()
+                )
                 shown.append(as_markers(points, experiment.trials.labels))
-                observed = as_markers(replay.trials.observed.cpu().numpy(), experiment.trials.labels)
+                observed = as_markers(
+                    replay.trials.observed.cpu().numpy(), experiment.trials.labels
+                )
                 progress.advance()
         where = np.where(np.isfinite(observed), shown[1], np.nan)
         pairs = ((shown[0], observed), (shown[1], observed), (shown[0], where))

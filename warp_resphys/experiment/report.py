@@ -1,4 +1,5 @@
-"""Stage: writes the report page of a split, and of a cross-validation, from the files of the run folder.
+"""Stage: writes the report page of a split, and of a cross-validation,
+from the files of the run folder.
 
 Functions that read a file raise a DataFileError if the file is missing or damaged.
 """
@@ -61,18 +62,22 @@ def make_report(context: StageContext) -> None:
     """Writes report.html of a split, with its figures and, if there is one, its video.
 
     Raises:
-        DataFileError: a file of an earlier stage is missing or damaged, or a file could not be written.
+        DataFileError: a file of an earlier stage is missing or damaged, or a file could not be
+            written.
     """
     from ..report.pages import run_page  # matplotlib
 
-    run_page.write_report(context.run_dir / REPORT, RunReader(context.run_dir, context.settings).report())
+    run_page.write_report(
+        context.run_dir / REPORT, RunReader(context.run_dir, context.settings).report()
+    )
 
 
 def make_folds_report(context: StageContext) -> None:
-    """Writes report.html of a cross-validation, from metrics.json and the files that all folds share.
+    """Writes report.html of a cross-validation, from metrics.json and files that all folds share.
 
     Raises:
-        DataFileError: a file of an earlier stage is missing or damaged, or a file could not be written.
+        DataFileError: a file of an earlier stage is missing or damaged, or a file could not be
+            written.
     """
     from ..report.pages import run_page  # matplotlib
 
@@ -102,7 +107,9 @@ def true_contact(run: RunSettings) -> dict[str, float]:
             truth[f"contact_{key}{part}"] = value[name] if isinstance(value, dict) else value
         if name in run.obstacles:
             shift = np.subtract(obstacle.position, run.obstacles[name].position)
-            truth |= {f"obstacle_{axis}{part}": float(x) for axis, x in zip("xyz", shift, strict=True)}
+            truth |= {
+                f"obstacle_{axis}{part}": float(x) for axis, x in zip("xyz", shift, strict=True)
+            }
     return truth
 
 
@@ -119,7 +126,8 @@ class RunReader:
 
     def __init__(self, folder: Path, run: RunSettings) -> None:
         self.folder, self.run, self.common = folder, run, common_folder(folder)
-        self._hidden = ("resphys",) if run.reconstruction is None else ()  # equal to the simulator below it
+        # Equal to the simulator below it.
+        self._hidden = ("resphys",) if run.reconstruction is None else ()
 
     @cached_property
     def body(self) -> Body:
@@ -142,10 +150,14 @@ class RunReader:
         identification = Identification.read(self.folder / IDENTIFICATION)
         metrics = shown_metrics(collect_metrics(self.folder, run))
         material = read_if_there(self.common / TRUTH).get("material", {})
-        moved = self.dataset.contact_at(trials.names, body, self.dataset.time_step)  # (K + 1, R, O) inputs, by name
+        # (K + 1, R, O) inputs, by name
+        moved = self.dataset.contact_at(trials.names, body, self.dataset.time_step)
         assert run.tip is not None
         names = {name for result in identification.values() for name in result.parameters}
-        histories = ((m, read_if_there(path).get("epochs")) for m, path in training_files(self.folder, run).items())
+        histories = (
+            (m, read_if_there(path).get("epochs"))
+            for m, path in training_files(self.folder, run).items()
+        )
         return RunReport(
             metrics=metrics,
             settings=run,
@@ -154,8 +166,13 @@ class RunReader:
             tip=np.empty(0, np.int64) if trials.labels else vertices_at(body.mesh, run.tip),
             chambers=self._driven_chambers(),
             tendons=routes_of(body),
-            obstacles=ObstacleSurface.of(body, identification.get("sysid", Identification()).parameters),
-            moved={name: {key: x[:, row] for key, x in moved.items()} for row, name in enumerate(trials.names)},
+            obstacles=ObstacleSurface.of(
+                body, identification.get("sysid", Identification()).parameters
+            ),
+            moved={
+                name: {key: x[:, row] for key, x in moved.items()}
+                for row, name in enumerate(trials.names)
+            },
             trials=trials,
             film=self.film,
             driven=self.driven,
@@ -165,7 +182,8 @@ class RunReader:
             actuator=read_actuator(self.folder) if run.with_actuator else {},
             **(self._stretches(metrics["law"]) if "law" in metrics else {}),
             start=configured_parameters(build_simulator(run, run.simulation), sorted(names)),
-            truth={name: value for name, value in material.items() if name != "model"} | true_contact(run),
+            truth={name: value for name, value in material.items() if name != "model"}
+            | true_contact(run),
             true_material=material.get("model", "corotated"),
             training={model: epochs for model, epochs in histories if epochs},
             followed=self._followed(),
@@ -173,7 +191,7 @@ class RunReader:
 
     @cached_property
     def trials(self) -> TrialResults:
-        """Observations of the test trials and roll-outs of the models, up to the evaluated duration.
+        """Observations of the test trials and roll-outs of models, up to the evaluated duration.
 
         Roll-outs with scaled inputs are left out.
         """
@@ -183,20 +201,34 @@ class RunReader:
         with read_hdf5(self.folder / ROLLOUTS, "rollouts") as file:
             rolled = tuple(map(str, read_attribute(file, "names")))
             test = [name for name in rolled if self.scaled is None or name not in self.scaled.names]
-            models = [model for model in models_in_figures(errors["errors_mm"]) if f"{model}_observed" in file]
+            models = [
+                model
+                for model in models_in_figures(errors["errors_mm"])
+                if f"{model}_observed" in file
+            ]
             models = [model for model in models if model not in self._hidden]
             unknown = sorted(set(test) - set(trials.names))
             if unknown or not models:
-                what = f"names trials that {self.common / DATASET} does not hold ({', '.join(unknown)})"
+                what = (
+                    f"names trials that {self.common / DATASET} does not hold "
+                    f"({', '.join(unknown)})"
+                )
                 what = what if unknown else "holds no model"
-                raise DataFileError(f"{self.folder / ROLLOUTS} {what}: delete it and run the same command again.")
+                raise DataFileError(
+                    f"{self.folder / ROLLOUTS} {what}: delete it and run the same command again."
+                )
             shape = (len(rolled), *trials.observed.shape[1:])
-            spread, known = (*shape[:2], len(owners(trials.labels))), [m for m in models if f"{m}_spread" in file]
+            spread = (*shape[:2], len(owners(trials.labels)))
+            known = [m for m in models if f"{m}_spread" in file]
             positions = {m: read_array(file, f"{m}_observed", shape)[: len(test)] for m in models}
             spreads = {m: read_array(file, f"{m}_spread", spread)[: len(test)] for m in known}
         calibrated = errors["intervals"]["models"] if "intervals" in errors else {}
         half_widths = half_widths_of(trials, test, calibrated, positions, spreads)
-        unseen = None if run.markers is None else marker_view_of(run.markers, trials.labels, trials.sets).unseen
+        unseen = (
+            None
+            if run.markers is None
+            else marker_view_of(run.markers, trials.labels, trials.sets).unseen
+        )
         rows = trials.rows(test)
         times, target = trials.times[rows], trials.observed[rows]
         begins = tuple(trials.begins[row] for row in rows)
@@ -204,7 +236,8 @@ class RunReader:
         if seconds is not None:
             target = np.where((times <= seconds)[..., None, None], target, np.nan)
             length = max(1, int((times <= seconds).any(axis=0).sum()))
-        if set(begins) == {STATIC}:  # Static poses beside motions are padded to the same number of frames.
+        if set(begins) == {STATIC}:
+            # Static poses beside motions are padded to the same number of frames.
             length = 1
         return TrialResults(
             names=tuple(test),
@@ -212,7 +245,10 @@ class RunReader:
             begins=begins,
             times=times[:, :length],
             target=as_markers(target[:, :length], trials.labels),
-            positions={model: as_markers(points[:, :length], trials.labels) for model, points in positions.items()},
+            positions={
+                model: as_markers(points[:, :length], trials.labels)
+                for model, points in positions.items()
+            },
             bound=as_markers(bound, trials.labels),
             gravity=trials.gravity,
             time_step=trials.time_step,
@@ -228,17 +264,26 @@ class RunReader:
             if "film_steps" not in file:
                 return None
             steps = read_array(file, "film_steps", (None,)).astype(np.float64)
-            models = [model for model in MODELS if f"{model}_film" in file and model not in self._hidden]
+            models = [
+                model for model in MODELS if f"{model}_film" in file and model not in self._hidden
+            ]
             shape = (len(steps), None, 3)
-            bodies = {model: read_array(file, f"{model}_film", shape).astype(np.float64) for model in models}
-            trial, times = str(read_attribute(file, "film_trial")), float(read_attribute(file, "time_step")) * steps
+            bodies = {
+                model: read_array(file, f"{model}_film", shape).astype(np.float64)
+                for model in models
+            }
+            trial = str(read_attribute(file, "film_trial"))
+            times = float(read_attribute(file, "time_step")) * steps
         if trials.bound is not None and run.markers is not None:
             view = marker_view_of(run.markers, trials.labels, trials.sets)
             if view.shape_alone:
                 has = np.flatnonzero(trials.present[trials.names.index(trial)]).tolist()
                 markers = bound_markers(run.markers, self.body.mesh, trials.bound, trials.labels)
-                view, at = view.select(has), {model: torch.from_numpy(q) for model, q in bodies.items()}
-                bodies = {model: view.carried(q, markers(q)[:, has]).numpy() for model, q in at.items()}
+                view = view.select(has)
+                at = {model: torch.from_numpy(q) for model, q in bodies.items()}
+                bodies = {
+                    model: view.carried(q, markers(q)[:, has]).numpy() for model, q in at.items()
+                }
         return Film(trial, times, bodies)
 
     @cached_property
@@ -256,7 +301,9 @@ class RunReader:
             values,
             self.run.input_limit,
             scaled=() if scaled is None else scaled.names,
-            poses=tuple(n for n, begins in zip(trials.names, trials.begins, strict=True) if begins == STATIC),
+            poses=tuple(
+                n for n, begins in zip(trials.names, trials.begins, strict=True) if begins == STATIC
+            ),
         )
 
     def recordings(self, mesh: Mesh, moved: Mapping[str, FloatArray]) -> Recordings | None:
@@ -264,7 +311,8 @@ class RunReader:
 
         Args:
             mesh: mesh of the body at rest.
-            moved: (3,) displacements of the markers from the undeformed body to the body at rest [m], by label.
+            moved: (3,) displacements of the markers from the undeformed body to the body at rest
+                [m], by label.
         """
         markers = self.run.markers
         if markers is None:
@@ -282,19 +330,25 @@ class RunReader:
         Where markers are observed, the test trials are the body of the film, which is simulated.
 
         Returns:
-            ``stretches``: the least and the largest one in the test trials, and in the training of the law.
-            ``outside``: the share of cells and states of the test trials outside of the training; None if it is not
-            known.
+            ``stretches``: the least and the largest one in the test trials, and in the training of
+            the law. ``outside``: the share of cells and states of the test trials outside of the
+            training; None if it is not known.
         """
         trials, film, learned = self.trials, self.film, law.get("stretches")
-        trained = {} if learned is None else {"the training": (float(learned[0]), float(learned[1]))}
+        trained = (
+            {} if learned is None else {"the training": (float(learned[0]), float(learned[1]))}
+        )
         if trials.labels and film is None:
             return {"stretches": trained, "outside": None}
         name, bodies = "all test trials", trials.target
         if trials.labels and film is not None:
             name, bodies = f"the trial {film.trial}", next(reversed([*film.positions.values()]))
         values = principal_stretches(self.body.mesh, bodies.reshape(-1, *bodies.shape[-2:]))
-        outside = None if learned is None else share_outside(values, trained["the training"], modes_of(law))
+        outside = (
+            None
+            if learned is None
+            else share_outside(values, trained["the training"], modes_of(law))
+        )
         return {
             "stretches": {name: (float(np.nanmin(values)), float(np.nanmax(values))), **trained},
             "outside": outside,
@@ -310,9 +364,13 @@ class RunReader:
             for name in map(str, read_attribute(file, "names")):
                 shape, seconds = name.removesuffix("s").rsplit("_", 1)
                 path = read_array(file, f"{name}/path", (None, 3)).astype(np.float64)
-                points = read_array(file, f"{name}/points", (len(controllers), len(path), 3)).astype(np.float64)
+                points = read_array(
+                    file, f"{name}/points", (len(controllers), len(path), 3)
+                ).astype(np.float64)
                 by_name = dict(zip(controllers, points, strict=True))
-                followed.append(FollowedPath(name=shape, seconds=float(seconds), path=path, points=by_name))
+                followed.append(
+                    FollowedPath(name=shape, seconds=float(seconds), path=path, points=by_name)
+                )
         return followed
 
     def _driven_chambers(self) -> tuple[Chamber, ...]:
@@ -329,8 +387,8 @@ class RunReader:
     def _at_rest(self) -> tuple[Mesh, dict[str, FloatArray]]:
         """Mesh of the body at rest, and displacement (3,) of each marker there [m], by label.
 
-        If trials begin at rest, this is the equilibrium of the uncorrected simulator without inputs; otherwise the body
-        is undeformed.
+        If trials begin at rest, this is the equilibrium of the uncorrected simulator without
+        inputs; otherwise the body is undeformed.
         """
         mesh, trials, film, model = self.body.mesh, self.trials, self.film, "simulation"
         if film is None or model not in film.positions or film.trial not in trials.names:
@@ -339,4 +397,6 @@ class RunReader:
         if trials.begins[row] != "rest":
             return mesh, {}
         moved = trials.positions[model][row, 0] - trials.bound
-        return Mesh(film.positions[model][0], mesh.cells), dict(zip(trials.labels, moved, strict=True))
+        return Mesh(film.positions[model][0], mesh.cells), dict(
+            zip(trials.labels, moved, strict=True)
+        )

@@ -32,29 +32,40 @@ from .files import (
 
 
 def common_folder(folder: Path) -> Path:
-    """Folder of the files that do not depend on the fold: the folder itself, or the parent of a fold's folder."""
+    """Folder of the files that do not depend on the fold:
+    the folder itself, or the parent of a fold's folder.
+    """
     return folder if (folder / DATASET).is_file() else folder.parent
 
 
 def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None = None) -> Metrics:
     """Contents of metrics.json of a split.
 
-    These are errors, noise of the observations if known, selected weights, results of identification and
-    reconstruction, time and memory of the stages (by default all finished stages, in order of completion), versions and
-    device.
+    These are errors, noise of the observations if known, selected weights, results of
+    identification and reconstruction, time and memory of the stages (by default all finished
+    stages, in order of completion), versions and device.
     """
     if stages is None:
-        records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
-        stages = [path.stem for path in records if "." not in path.stem]  # without files of interrupted stages
+        records = sorted(
+            (folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns
+        )
+        # Without files of interrupted stages.
+        stages = [path.stem for path in records if "." not in path.stem]
     files = training_files(folder, run)
     common, identified = common_folder(folder), Identification.read(folder / IDENTIFICATION)
     errors: ErrorTables = read_json(folder / ERRORS)
     metrics: Metrics = {
         **errors,
-        "networks": {name: read_json(path)["kept"] for name, path in files.items() if path.is_file()},
+        "networks": {
+            name: read_json(path)["kept"] for name, path in files.items() if path.is_file()
+        },
         "parameters": {name: result.parameters for name, result in identified.items()},
-        "first_guesses": {name: result.first_guess for name, result in identified.items() if result.first_guess},
-        "at_bounds": {name: at_bounds(result) for name, result in identified.items() if result.at_bounds},
+        "first_guesses": {
+            name: result.first_guess for name, result in identified.items() if result.first_guess
+        },
+        "at_bounds": {
+            name: at_bounds(result) for name, result in identified.items() if result.at_bounds
+        },
         **resources_used(folder, stages),
         "versions": package_versions(),
         "device": str(choose_device(run.device)),
@@ -63,7 +74,9 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
     law: LawContent | None = None if run.law is None else read_if_there(folder / LAW_FILE) or None
     if law is not None:
         metrics["law"] = {**law, "against": "sysid" if "sysid" in identified else "simulation"}
-    if run.reconstruction is not None and (reconstruction := read_if_there(folder / RECONSTRUCTION)):
+    if run.reconstruction is not None and (
+        reconstruction := read_if_there(folder / RECONSTRUCTION)
+    ):
         metrics["reconstruction"] = reconstruction
     if run.control is not None and (control := read_if_there(folder / CONTROL)):
         metrics["control"] = control
@@ -82,19 +95,28 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
 
 
 def at_bounds(identified: Identification) -> dict[str, float]:
-    """Identified values that lie on a bound of their range, by name; those of single trials have their names too."""
+    """Identified values that lie on a bound of their range, by name.
+
+    Those of single trials have their names too.
+    """
     values = {**identified.parameters, **identified.of_trials}
     return {name: values[name] for name in identified.at_bounds if name in values}
 
 
-def placement(registered: Mapping[str, RegistrationSummary], identified: Mapping[str, Identification]) -> Placed:
-    """Largest residual of the registration of a trial [mm], and the identified rotation of the markers [degrees].
+def placement(
+    registered: Mapping[str, RegistrationSummary], identified: Mapping[str, Identification]
+) -> Placed:
+    """Largest residual of the registration of a trial [mm],
+    and the identified rotation of the markers [degrees].
 
     Markers that the registration of some trial leaves out have their largest residual there [mm].
     """
     placed = [result.placement for result in identified.values() if result.placement is not None]
     turned = max((math.hypot(*one["turn"]) for one in placed), default=0.0)
-    found: Placed = {"rms_mm": max(fit["rms_mm"] for fit in registered.values()), "turned_deg": math.degrees(turned)}
+    found: Placed = {
+        "rms_mm": max(fit["rms_mm"] for fit in registered.values()),
+        "turned_deg": math.degrees(turned),
+    }
     off = dict[str, float]()
     for fit in registered.values():
         for label in fit.get("outliers", ()):

@@ -1,7 +1,10 @@
-"""Stage: simulates the trials of an experiment without recordings; the simulation that plays the real body.
+"""Stage: simulates the trials of an experiment without recordings.
 
-The mesh, regions, material, actuators, integrator and time step of this target are its own (`TargetSettings`). Its
-positions and velocities are interpolated to other vertices x by the shape functions of the cells that contain them,
+The simulation that plays the real body.
+
+The mesh, regions, material, actuators, integrator and time step of this target are its own
+(`TargetSettings`). Its positions and velocities are interpolated to other vertices x by the shape
+functions of the cells that contain them,
 
     q(x) = sum_a N_a(x) q_a,
 
@@ -44,7 +47,8 @@ from .files import DATASET
 
 LOADS: Final = "sensors"  # owner of the readings in the memory of a state
 Read = Callable[[State, State, Inputs, Constants], torch.Tensor]
-_LARGEST_DISTANCE = 0.2  # of a vertex from the cell of the other mesh that it is extrapolated from, over its diagonal
+# Of a vertex from the cell of the other mesh that it is extrapolated from, over its diagonal.
+_LARGEST_DISTANCE = 0.2
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,8 @@ class Target:
     Attributes:
         simulator: its simulator, on its own mesh.
         substeps: number of its steps per time step of the corrected simulator.
-        seen: map from values (B, N', 3) at its vertices to values (B, N, 3) at those of the corrected simulator.
+        seen: map from values (B, N', 3) at its vertices to values (B, N, 3) at those of the
+            corrected simulator.
     """
 
     simulator: Simulator
@@ -75,34 +80,42 @@ def build_target(settings: SimulatorSettings, target: TargetSettings) -> Target:
     """
     simulator = build_simulator(target_settings(settings, target), target.material)
     seen = vertices_in(simulator.body.mesh, build_body(settings).mesh)
-    return Target(simulator, substeps_of(settings.time_step, target, "target"), seen.to(simulator.rest_positions))
+    return Target(
+        simulator,
+        substeps_of(settings.time_step, target, "target"),
+        seen.to(simulator.rest_positions),
+    )
 
 
 def target_settings(settings: SimulatorSettings, target: TargetSettings) -> SimulatorSettings:
     """Settings of the simulator of a target; gravity, solver and device are those of the run."""
-    return SimulatorSettings.of(settings, **{key: getattr(target, key) for key in SteppedSettings.model_fields})
+    return SimulatorSettings.of(
+        settings, **{key: getattr(target, key) for key in SteppedSettings.model_fields}
+    )
 
 
 def substeps_of(time_step: float, target: TargetSettings, key: str) -> int:
     """Number of steps of a target per time step of the corrected simulator [s].
 
     Raises:
-        InputError: the time step is not a multiple of the target's; ``key`` is the group of the target.
+        InputError: the time step is not a multiple of the target's; ``key`` is the group of the
+            target.
     """
     ratio = time_step / target.time_step
     if abs(ratio - round(ratio)) > 1e-6 or round(ratio) < 1:
         raise InputError(
-            f"time_step is {time_step:g} s and {key}.time_step {target.time_step:g} s: the first must be a multiple of "
-            "the second."
+            f"time_step is {time_step:g} s and {key}.time_step {target.time_step:g} s: the first "
+            "must be a multiple of the second."
         )
     return round(ratio)
 
 
 @lru_cache(maxsize=4)
 def vertices_in(mesh: Mesh, other: Mesh) -> Observation:
-    """Map from values (B, N', 3) at the vertices of a mesh to values (B, N, 3) at those of another one.
+    """Map from values (B, N', 3) at vertices of a mesh to values (B, N, 3) at those of another one.
 
-    Vertices slightly outside, as on a coarser curved surface, are extrapolated from the nearest cell.
+    Vertices slightly outside, as on a coarser curved surface, are extrapolated from the nearest
+    cell.
 
     Raises:
         MeshError: a vertex of the other mesh lies outside of the first.
@@ -115,24 +128,30 @@ def vertices_in(mesh: Mesh, other: Mesh) -> Observation:
     if place.outside[far] > _LARGEST_DISTANCE * size[far]:
         x, y, z = other.vertices[far]
         raise MeshError(
-            f"the simulator's vertex at ({x:g}, {y:g}, {z:g}) m lies outside of this mesh: both must be the same body "
-            "in the same place."
+            f"the simulator's vertex at ({x:g}, {y:g}, {z:g}) m lies outside of this mesh: both "
+            "must be the same body in the same place."
         )
-    return MarkerMap(torch.as_tensor(mesh.cells[place.cells])[None], torch.as_tensor(place.weights)[None])
+    return MarkerMap(
+        torch.as_tensor(mesh.cells[place.cells])[None], torch.as_tensor(place.weights)[None]
+    )
 
 
 def simulate(context: StageContext) -> None:
-    """Writes dataset.h5: positions and velocities (R, T + 1, N, 3) of all trials, starting from the held state."""
+    """Writes dataset.h5: positions and velocities (R, T + 1, N, 3) of all trials,
+    starting from the held state.
+    """
     settings: StageSettings = context.settings
     trials, data = settings.trials, settings.data
     frames, names = data.steps + 1, tuple(trial.name for trial in trials)
-    times, points = settings.time_step * np.arange(frames, dtype=np.float64), whole_mesh(settings).vertices
+    times = settings.time_step * np.arange(frames, dtype=np.float64)
+    points = whole_mesh(settings).vertices
     base, obstacles = true_motions(data, trials, times)
     for poses in () if base is None else base:
         check_steps(poses, points, "data.base_motion")
     for name, moved in obstacles.items():
         check_steps(moved[0], points, f"data.obstacle_motion.{name}", f"the obstacle {name!r}")
-    parts, part = Parts.of(context), TrialPart("part_000", names, frames, partial(_free_motion, settings, names))
+    parts = Parts.of(context)
+    part = TrialPart("part_000", names, frames, partial(_free_motion, settings, names))
     parts.run([part])
     observed = parts.read(part, "observed")
     Trials(
@@ -163,18 +182,27 @@ def true_motions(
         times: (T,) times [s].
 
     Returns:
-        (R, T, 6) of the base, None if it stands still in all trials, and of obstacles by name, zero in trials in which
-        they stand still.
+        (R, T, 6) of the base, None if it stands still in all trials, and of obstacles by name, zero
+        in trials in which they stand still.
     """
     common, still = data.base_motion, np.zeros((len(times), 6))
-    motions = [trial.base_motion or (common if isinstance(common, MotionSettings) else None) for trial in trials]
+    motions = [
+        trial.base_motion or (common if isinstance(common, MotionSettings) else None)
+        for trial in trials
+    ]
     scales = [trial.amount if isinstance(data, MovingBase) else 1.0 for trial in trials]
     base = [
         still if motion is None else prescribed(motion, times, scale=scale)
         for motion, scale in zip(motions, scales, strict=True)
     ]
-    pushed = [prescribed_all(data.obstacle_motion, trial.obstacle_motion, times) for trial in trials]
-    obstacles = {name: np.stack([poses.get(name, still) for poses in pushed]) for poses in pushed for name in poses}
+    pushed = [
+        prescribed_all(data.obstacle_motion, trial.obstacle_motion, times) for trial in trials
+    ]
+    obstacles = {
+        name: np.stack([poses.get(name, still) for poses in pushed])
+        for poses in pushed
+        for name in poses
+    }
     return np.stack(base) if any(motions) else None, obstacles
 
 
@@ -198,16 +226,22 @@ def played(
         trials: trials of the part.
         begin: state of the first frame.
         inputs_at: inputs besides motions, at a share of the time from a frame to the next.
-        read: returns readings (B, S, 6) of force sensors after a step, which states have in their memory (`LOADS`).
+        read: returns readings (B, S, 6) of force sensors after a step, which states have in their
+            memory (`LOADS`).
     """
     times = simulator.time_step * np.arange((frames - 1) * substeps + 1)
     base, obstacles = true_motions(data, trials, times)
-    constants, moving = simulator.prepare(), dict[str, torch.Tensor]()  # inputs at the times, by name
+    # Inputs at the times, by name.
+    constants, moving = simulator.prepare(), dict[str, torch.Tensor]()
     if obstacles:
-        moved = contact_inputs(simulator.body, {name: poses.swapaxes(0, 1) for name, poses in obstacles.items()})
+        moved = contact_inputs(
+            simulator.body, {name: poses.swapaxes(0, 1) for name, poses in obstacles.items()}
+        )
         moving |= {name: simulator.tensor(values) for name, values in moved.items()}
     if base is not None:
-        fixed = np.asarray(simulator.body.mesh.vertices[simulator.body.fixed_vertices], dtype=np.float64)
+        fixed = np.asarray(
+            simulator.body.mesh.vertices[simulator.body.fixed_vertices], dtype=np.float64
+        )
         at_times = rigid(base.swapaxes(0, 1).reshape(-1, 6)).apply(fixed)
         moving["fixed_positions"] = simulator.tensor(at_times).unflatten(0, (len(times), -1))
 
@@ -215,9 +249,15 @@ def played(
         frame, i = divmod(number, substeps)
         # Inputs are taken at the end of a step, or in its middle.
         share = (i + 1 - 0.5 * (simulator.integrator == "midpoint")) / substeps
-        now = inputs_at(frame, share).replace(**{name: values[number + 1] for name, values in moving.items()})
+        now = inputs_at(frame, share).replace(
+            **{name: values[number + 1] for name, values in moving.items()}
+        )
         new = simulator.step(state, now, constants)
-        return new if read is None else new.with_memory({"loads": read(new, state, now, constants)}, LOADS)
+        return (
+            new
+            if read is None
+            else new.with_memory({"loads": read(new, state, now, constants)}, LOADS)
+        )
 
     if substeps:
         yield from islice(states(step, begin, range((frames - 1) * substeps)), 0, None, substeps)
@@ -226,14 +266,21 @@ def played(
 
 
 def _free_motion(settings: StageSettings, names: Sequence[str], report: Report) -> Arrays:
-    """Positions and velocities of all vertices of released bodies, or of bodies with a moving base."""
-    target, seen = build_target(settings, settings.target), list[tuple[torch.Tensor, torch.Tensor]]()
+    """Positions and velocities of all vertices of released bodies,
+    or of bodies with a moving base.
+    """
+    target = build_target(settings, settings.target)
+    seen = list[tuple[torch.Tensor, torch.Tensor]]()
     trials = [trial for trial in settings.trials if trial.name in names]
     begin = initial_state(target.simulator, settings.data, trials)
-    for state in played(settings.data.steps + 1, target.simulator, target.substeps, settings.data, trials, begin):
+    for state in played(
+        settings.data.steps + 1, target.simulator, target.substeps, settings.data, trials, begin
+    ):
         seen.append((target.seen(state.q), target.seen(state.v)))
         report()
-    observed, velocity = (torch.stack(values, 1).cpu().numpy() for values in zip(*seen, strict=True))
+    observed, velocity = (
+        torch.stack(values, 1).cpu().numpy() for values in zip(*seen, strict=True)
+    )
     return {"observed": (observed, "m"), "velocity": (velocity, "m/s")}
 
 
@@ -243,14 +290,21 @@ def initial_state(simulator: Simulator, data: SimulatedData, trials: Sequence[Tr
     Raises:
         InputError: a weight hangs on fixed vertices only.
     """
-    amounts, q = np.array([trial.amount for trial in trials]), simulator.rest_state(len(trials)).q.clone()
+    amounts = np.array([trial.amount for trial in trials])
+    q = simulator.rest_state(len(trials)).q.clone()
     if isinstance(data, MovingBase):
         q = simulator.static_equilibrium(Inputs(), batch=len(trials)).q
     elif isinstance(data, ReleaseFromTwist):
-        q = twisted(simulator.rest_positions, simulator.tensor(amounts), "xyz".index(data.twist_axis))
+        q = twisted(
+            simulator.rest_positions, simulator.tensor(amounts), "xyz".index(data.twist_axis)
+        )
     else:
         forces = weights(simulator, data.load, amounts[:, None] * np.asarray(simulator.gravity))
-        twists = {row: trial.load[0] for row, trial in enumerate(trials) if trial.load and trial.load[0].twist_deg}
+        twists = {
+            row: trial.load[0]
+            for row, trial in enumerate(trials)
+            if trial.load and trial.load[0].twist_deg
+        }
         for row, trial in enumerate(trials):
             if trial.load and row not in twists:
                 forces[row] = loads(simulator, trial.load, data.load, "data.others")
@@ -268,7 +322,9 @@ def twist(simulator: Simulator, load: HeldSettings) -> torch.Tensor:
     return twisted(simulator.rest_positions, angle, "xyz".index(load.twist_axis))
 
 
-def loads(simulator: Simulator, held: Sequence[HeldSettings], load: Place, key: str) -> torch.Tensor:
+def loads(
+    simulator: Simulator, held: Sequence[HeldSettings], load: Place, key: str
+) -> torch.Tensor:
     """Nodal forces (1, N, 3) of weights that act at the same time [N].
 
     Args:
@@ -288,7 +344,9 @@ def loads(simulator: Simulator, held: Sequence[HeldSettings], load: Place, key: 
     return total
 
 
-def weights(simulator: Simulator, load: Place, forces: FloatArray, key: str = "data.load") -> torch.Tensor:
+def weights(
+    simulator: Simulator, load: Place, forces: FloatArray, key: str = "data.load"
+) -> torch.Tensor:
     """Nodal forces (B, N, 3) of total forces (B, 3) in equal shares on the vertices of a place [N].
 
     Raises:
@@ -296,7 +354,9 @@ def weights(simulator: Simulator, load: Place, forces: FloatArray, key: str = "d
     """
     face = vertices_at(simulator.body.mesh, load)
     if np.isin(face, simulator.body.fixed_vertices).all():
-        raise InputError(f"{key} selects fixed vertices only: hang the weights on vertices that can move.")
+        raise InputError(
+            f"{key} selects fixed vertices only: hang the weights on vertices that can move."
+        )
     return distributed(simulator, face, simulator.tensor(forces))
 
 

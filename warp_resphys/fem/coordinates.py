@@ -1,11 +1,12 @@
 """Vertices as weighted sums of control vertices that may slide in planes, x = W (P r + o).
 
-A free vertex is its own control vertex. A glued vertex has the shape functions of the face it is glued to as weights.
-A rigid part is an affine body (Lan et al., Affine Body Dynamics, 2022): it is controlled by four of its vertices, and
-the weights of the others are their barycentric coordinates. As W acts on each component alike, the operator
-F = sum_a x_a g_a^T of a point keeps its form, F = sum_c r_c (sum_a W_ac g_a)^T: energies use control vertices only, and
-the Hessian in r, W^T H W, is assembled without forming H. A control vertex in a symmetry plane through its rest
-position x0 moves along the plane only: P = I - n n^T and o = (I - P) x0; for all other vertices P = I.
+A free vertex is its own control vertex. A glued vertex has the shape functions of the face it is
+glued to as weights. A rigid part is an affine body (Lan et al., Affine Body Dynamics, 2022): it is
+controlled by four of its vertices, and the weights of the others are their barycentric coordinates.
+As W acts on each component alike, the operator F = sum_a x_a g_a^T of a point keeps its form,
+F = sum_c r_c (sum_a W_ac g_a)^T: energies use control vertices only, and the Hessian in r, W^T H W,
+is assembled without forming H. A control vertex in a symmetry plane through its rest position x0
+moves along the plane only: P = I - n n^T and o = (I - P) x0; for all other vertices P = I.
 """
 
 from collections.abc import Sequence
@@ -29,9 +30,11 @@ _FLAT = 1e-3  # smallest height of the tetrahedron that controls a rigid part, o
 
 @dataclass(frozen=True)
 class SymmetryPlane:
-    """The plane n . x = offset that cuts a symmetric body: its vertices in the plane only move within it.
+    """The plane n . x = offset that cuts a symmetric body:
+    its vertices in the plane only move within it.
 
-    The mesh is one side of the body; its motion is that of the whole body as long as loads and motion are symmetric.
+    The mesh is one side of the body; its motion is that of the whole body as long as loads and
+    motion are symmetric.
 
     Raises:
         InputError: a normal of zero length, or numbers that are not finite.
@@ -44,13 +47,22 @@ class SymmetryPlane:
     def __post_init__(self) -> None:
         """Checks the numbers and scales the normal."""
         normal = np.asarray(self.normal, dtype=np.float64)
-        if normal.shape != (3,) or not np.isfinite([*normal, self.offset]).all() or not normal.any():
-            raise InputError(f"a symmetry plane has the normal {self.normal}: give three finite numbers, not all zero.")
+        if (
+            normal.shape != (3,)
+            or not np.isfinite([*normal, self.offset]).all()
+            or not normal.any()
+        ):
+            raise InputError(
+                f"a symmetry plane has the normal {self.normal}: "
+                "give three finite numbers, not all zero."
+            )
         object.__setattr__(self, "normal", tuple((normal / np.linalg.norm(normal)).tolist()))
 
     def contains(self, vertices: FloatArray) -> BoolArray:
         """Returns (N,) whether vertices (N, 3) [m] lie in the plane."""
-        return np.asarray(np.abs(vertices @ np.asarray(self.normal) - self.offset) <= self.tolerance)
+        return np.asarray(
+            np.abs(vertices @ np.asarray(self.normal) - self.offset) <= self.tolerance
+        )
 
 
 def tangential_projections(normals: FloatArray, touched: BoolArray) -> FloatArray:
@@ -61,19 +73,26 @@ def tangential_projections(normals: FloatArray, touched: BoolArray) -> FloatArra
         touched: (R, S) whether a vertex lies in a plane.
     """
     combinations, which = np.unique(touched, axis=0, return_inverse=True)
-    by_combination = [np.eye(3) - np.linalg.pinv(normals[planes]) @ normals[planes] for planes in combinations]
+    by_combination = [
+        np.eye(3) - np.linalg.pinv(normals[planes]) @ normals[planes] for planes in combinations
+    ]
     return np.asarray(by_combination)[which.reshape(-1)]
 
 
-def plane_shares(planes: Sequence[SymmetryPlane], plane: SymmetryPlane, vertices: FloatArray) -> FloatArray:
-    """Returns (R, 3) c: of a force f with which planes hold a vertex, one of them gives c . f along its normal.
+def plane_shares(
+    planes: Sequence[SymmetryPlane], plane: SymmetryPlane, vertices: FloatArray
+) -> FloatArray:
+    """Returns (R, 3) c: of a force f with which planes hold a vertex,
+    one of them gives c . f along its normal.
 
     Args:
         planes: the planes.
         plane: one of them.
-        vertices: (R, 3) rest positions of vertices that slide in them [m]; c is zero for those outside of the plane.
+        vertices: (R, 3) rest positions of vertices that slide in them [m]; c is zero for those
+            outside of the plane.
     """
-    normals, touched = np.array([one.normal for one in planes]), [one.contains(vertices) for one in planes]
+    normals = np.array([one.normal for one in planes])
+    touched = [one.contains(vertices) for one in planes]
     inside = np.stack(touched, axis=1)[:, :, None]
     return np.asarray(np.linalg.pinv((inside * normals).swapaxes(1, 2))[:, [*planes].index(plane)])
 
@@ -84,10 +103,10 @@ class Coordinates:
 
     n_vertices: int  # N
     dependent: IntArray  # (S,) vertices determined by control vertices, ascending
-    weights: scipy.sparse.csr_array  # (S, N) weights of the control vertices in each dependent vertex
-    sliding: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (R,) control vertices in planes
-    projections: FloatArray = field(default_factory=lambda: np.zeros((0, 3, 3)))  # (R, 3, 3) P of the sliding vertices
-    offsets: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (R, 3) o of the sliding vertices [m]
+    weights: scipy.sparse.csr_array  # (S, N) of control vertices in each dependent vertex
+    sliding: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (R,) in planes
+    projections: FloatArray = field(default_factory=lambda: np.zeros((0, 3, 3)))  # (R, 3, 3) P
+    offsets: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (R, 3) o [m]
 
     @classmethod
     def of(cls, dependence: scipy.sparse.csr_array) -> "Coordinates":
@@ -108,7 +127,10 @@ class Coordinates:
             matrix = scipy.sparse.csr_array(matrix @ matrix)
             matrix.eliminate_zeros()
         if matrix[:, dependent].nnz:
-            raise InputError("glued vertices determine each other: glue one side of an interface to the other only.")
+            raise InputError(
+                "glued vertices determine each other: "
+                "glue one side of an interface to the other only."
+            )
         return cls(n_vertices, dependent, scipy.sparse.csr_array(matrix[dependent]))
 
     @classmethod
@@ -116,14 +138,20 @@ class Coordinates:
         """Returns the map of several bodies with their vertices concatenated."""
         first = np.cumsum([0, *(part.n_vertices for part in maps)])
         dependent, sliding = (
-            np.concatenate([getattr(part, name) + start for part, start in zip(maps, first, strict=False)])
+            np.concatenate(
+                [getattr(part, name) + start for part, start in zip(maps, first, strict=False)]
+            )
             for name in ("dependent", "sliding")
         )
         weights = scipy.sparse.csr_array(scipy.sparse.block_diag([part.weights for part in maps]))
-        projections, offsets = (np.concatenate([getattr(part, n) for part in maps]) for n in ("projections", "offsets"))
+        projections, offsets = (
+            np.concatenate([getattr(part, n) for part in maps]) for n in ("projections", "offsets")
+        )
         return cls(int(first[-1]), dependent, weights, sliding, projections, offsets)
 
-    def with_planes(self, planes: Sequence[SymmetryPlane], vertices: FloatArray, fixed: IntArray) -> "Coordinates":
+    def with_planes(
+        self, planes: Sequence[SymmetryPlane], vertices: FloatArray, fixed: IntArray
+    ) -> "Coordinates":
         """Returns the map with vertices that slide in symmetry planes.
 
         Args:
@@ -132,7 +160,8 @@ class Coordinates:
             fixed: (D,) fixed vertices, which do not slide.
 
         Raises:
-            InputError: a plane without vertices, or with a dependent vertex whose control vertices lie outside of it.
+            InputError: a plane without vertices, or with a dependent vertex whose control vertices
+                lie outside of it.
         """
         if not planes:
             return self
@@ -140,18 +169,21 @@ class Coordinates:
         for plane, inside in zip(planes, contained.T, strict=True):
             if not inside.any():
                 raise InputError(
-                    f"no vertex lies in the symmetry plane with normal {plane.normal} and offset {plane.offset:g} m: "
-                    "move the plane or the mesh."
+                    f"no vertex lies in the symmetry plane with normal {plane.normal} and offset "
+                    f"{plane.offset:g} m: move the plane or the mesh."
                 )
             controls = abs(self.weights[inside[self.dependent]]).sum(axis=0) > _ROUNDING
             if (controls & ~inside).any():
                 raise InputError(
-                    f"a glued or rigid vertex in the symmetry plane with normal {plane.normal} is controlled by "
-                    "vertices outside of it: glue it to a face that the plane cuts too, or cut the rigid part by it."
+                    f"a glued or rigid vertex in the symmetry plane with normal {plane.normal} "
+                    "is controlled by vertices outside of it: glue it to a face that the plane "
+                    "cuts too, or cut the rigid part by it."
                 )
         contained[self.dependent] = contained[fixed] = False
         sliding = np.flatnonzero(contained.any(axis=1))
-        projections = tangential_projections(np.array([plane.normal for plane in planes]), contained[sliding])
+        projections = tangential_projections(
+            np.array([plane.normal for plane in planes]), contained[sliding]
+        )
         offsets = np.einsum("rij,rj->ri", np.eye(3) - projections, vertices[sliding])
         return replace(self, sliding=sliding, projections=projections, offsets=offsets)
 
@@ -165,7 +197,9 @@ class Coordinates:
         identity = scipy.sparse.eye_array(self.n_vertices, format="csc")
         free = np.ones(self.n_vertices)
         free[self.dependent] = 0.0
-        return scipy.sparse.csr_array(scipy.sparse.diags_array(free) + identity[:, self.dependent] @ self.weights)
+        return scipy.sparse.csr_array(
+            scipy.sparse.diags_array(free) + identity[:, self.dependent] @ self.weights
+        )
 
     def compose(self, points: P) -> P:
         """Returns points whose operators act on control vertices."""
@@ -177,7 +211,9 @@ class Coordinates:
         node = np.repeat(np.arange(rows.shape[0]), np.diff(rows.indptr))
         operators = points.gradients[touched].swapaxes(1, 2).reshape(-1, per_cell, components)[node]
         first = rows.indices[rows.indptr[:-1:k]]  # a control vertex of each cell
-        controls, composed = padded_operators(node // k, rows.indices, rows.data[:, None, None] * operators, first)
+        controls, composed = padded_operators(
+            node // k, rows.indices, rows.data[:, None, None] * operators, first
+        )
         width = max(k, controls.shape[1])
         # Cells are padded with their first vertex and a zero operator.
         nodes = np.repeat(points.nodes[:, :1], width, axis=1)
@@ -222,46 +258,66 @@ class DeviceCoordinates:
 
     def __init__(self, coordinates: Coordinates, like: torch.Tensor) -> None:
         self.dependent = torch.as_tensor(coordinates.dependent, device=like.device)
-        points = coordinates.points if coordinates else Points(np.zeros((0, 1), np.int64), np.zeros((0, 1, 1, 1)))
+        points = (
+            coordinates.points
+            if coordinates
+            else Points(np.zeros((0, 1), np.int64), np.zeros((0, 1, 1, 1)))
+        )
         self.controls = torch.as_tensor(points.nodes, device=like.device)
         self.weights = torch.as_tensor(points.gradients[:, 0, :, 0]).to(like)
         used = self.weights.ravel().nonzero().ravel()
-        entry = used[self.controls.ravel()[used].argsort(stable=True)]  # of `weights`, by control vertex
+        # Of `weights`, by control vertex.
+        entry = used[self.controls.ravel()[used].argsort(stable=True)]
         self._carried = self.dependent[entry // self.controls.shape[1]]
         self._shares = self.weights.ravel()[entry, None]
-        self._moved, self._counts = self.controls.ravel()[entry].unique_consecutive(return_counts=True)
+        self._moved, self._counts = self.controls.ravel()[entry].unique_consecutive(
+            return_counts=True
+        )
         self.depends, self.slides = len(coordinates.dependent) > 0, len(coordinates.sliding) > 0
         self.sliding = torch.as_tensor(coordinates.sliding, device=like.device)
         self.projections, self._offsets = (
-            torch.as_tensor(values).to(like) for values in (coordinates.projections, coordinates.offsets)
+            torch.as_tensor(values).to(like)
+            for values in (coordinates.projections, coordinates.offsets)
         )
 
     def expand(self, r: torch.Tensor) -> torch.Tensor:
-        """Returns a field (B, N, ...) with the values at dependent vertices computed from the control vertices."""
+        """Returns a field (B, N, ...) with the values
+        at dependent vertices computed from the control vertices.
+        """
         if not self.depends:
             return r
         at = [r.index_select(1, column) for column in self.controls.unbind(1)]
         return r.index_copy(1, self.dependent, weighted_sum(self.weights, at))
 
     def hold(self, r: torch.Tensor) -> torch.Tensor:
-        """Returns positions (B, N, 3) with those of sliding vertices projected onto their planes, P r + o."""
+        """Returns positions (B, N, 3) with those of sliding vertices projected onto their planes, P
+        r + o.
+        """
         if not self.slides:
             return r
         return r.index_copy(1, self.sliding, self._project(r) + self._offsets)
 
     def restrict(self, field: torch.Tensor) -> torch.Tensor:
-        """Returns forces or displacements (B, N, 3, ...) of control vertices, without those normal to planes, P f."""
+        """Returns forces or displacements (B, N, 3, ...) of control vertices,
+        without those normal to planes, P f.
+        """
         return field.index_copy(1, self.sliding, self._project(field)) if self.slides else field
 
     def _project(self, field: torch.Tensor) -> torch.Tensor:
-        return torch.einsum("rij,brj...->bri...", self.projections, field.index_select(1, self.sliding))
+        return torch.einsum(
+            "rij,brj...->bri...", self.projections, field.index_select(1, self.sliding)
+        )
 
     def normal(self, forces: torch.Tensor) -> torch.Tensor:
-        """Returns the part of forces (B, R, 3) on the sliding vertices that is normal to their planes, f - P f."""
+        """Returns the part of forces (B, R, 3) on the sliding vertices
+        that is normal to their planes, f - P f.
+        """
         return forces - torch.einsum("rij,brj->bri", self.projections.to(forces), forces)
 
     def reduce(self, forces: torch.Tensor) -> torch.Tensor:
-        """Returns W^T f of forces (B, N, 3, ...): those at dependent vertices are moved to their control vertices."""
+        """Returns W^T f of forces (B, N, 3, ...): those
+        at dependent vertices are moved to their control vertices.
+        """
         if not self.depends:
             return forces
         rows = forces.index_select(1, self._carried).movedim(1, 0).flatten(1) * self._shares
@@ -274,10 +330,11 @@ class DeviceCoordinates:
 def control_vertices(
     vertices: FloatArray, candidates: IntArray, name: str, planes: Sequence[SymmetryPlane] = ()
 ) -> IntArray:
-    """Returns four vertices that span a large tetrahedron, so that the weights of the others are small.
+    """Returns four vertices that span a large tetrahedron,
+    so that the weights of the others are small.
 
-    A vertex in a symmetry plane is controlled by vertices in that plane: three lie in a plane that cuts the part, two
-    in both of two planes, one in all of three.
+    A vertex in a symmetry plane is controlled by vertices in that plane: three lie in a plane that
+    cuts the part, two in both of two planes, one in all of three.
 
     Args:
         vertices: (N, 3) rest positions [m].
@@ -286,7 +343,8 @@ def control_vertices(
         planes: symmetry planes.
 
     Raises:
-        InputError: all candidates lie in a plane, or they have no such vertices in the symmetry planes.
+        InputError: all candidates lie in a plane, or they have no such vertices in the symmetry
+            planes.
     """
     places = vertices[candidates]
     inside = [flags for plane in planes if (flags := plane.contains(places)).any()]
@@ -303,12 +361,14 @@ def control_vertices(
         chosen.append(int(np.where(allowed, heights, -np.inf).argmax()))
         if not allowed.any() or (len(chosen) > 1 and not heights[chosen[-1]] > _FLAT * size):
             raise InputError(
-                f"the rigid part {name!r} has too few vertices along the {len(inside)} symmetry planes that touch it: "
-                "cut it by them."
+                f"the rigid part {name!r} has too few vertices along the {len(inside)} symmetry "
+                "planes that touch it: cut it by them."
                 if inside
-                else f"the rigid part {name!r} is flat: it needs vertices that do not lie in a plane."
+                else f"the rigid part {name!r} is flat: it needs vertices that do not lie in a "
+                "plane."
             )
-    for _ in range(0 if inside else 10):  # Exchange corners to enlarge the tetrahedron, until no weight exceeds one.
+    # Exchange corners to enlarge the tetrahedron, until no weight exceeds one.
+    for _ in range(0 if inside else 10):
         weights = barycentric(places[chosen], places)
         point, corner = np.unravel_index(int(np.abs(weights).argmax()), weights.shape)
         if abs(weights[point, corner]) < 1.0 + 1e-9:
@@ -318,7 +378,9 @@ def control_vertices(
 
 
 def _corner_sets(inside: Sequence[BoolArray], count: int) -> list[BoolArray]:
-    """Returns the candidates (count,) of each of the four control vertices, from those inside each symmetry plane."""
+    """Returns the candidates (count,) of each of the four control vertices,
+    from those inside each symmetry plane.
+    """
     match inside:
         case []:
             return [np.ones(count, dtype=bool)] * 4
@@ -340,24 +402,32 @@ def barycentric(corners: FloatArray, places: FloatArray) -> FloatArray:
 def rigid_weights(
     vertices: FloatArray, members: IntArray, name: str, planes: Sequence[SymmetryPlane] = ()
 ) -> tuple[IntArray, scipy.sparse.csr_array]:
-    """Returns the four control vertices of a rigid part, and their weights (N, N) in its other vertices."""
+    """Returns the four control vertices of a rigid part,
+    and their weights (N, N) in its other vertices.
+    """
     controls = control_vertices(vertices, members, name, planes)
     others = np.setdiff1d(members, controls)
     weights = barycentric(vertices[controls], vertices[others])
     return controls, dependence(len(vertices), others, np.tile(controls, (len(others), 1)), weights)
 
 
-def dependence(n_vertices: int, vertices: IntArray, controls: IntArray, weights: FloatArray) -> scipy.sparse.csr_array:
+def dependence(
+    n_vertices: int, vertices: IntArray, controls: IntArray, weights: FloatArray
+) -> scipy.sparse.csr_array:
     """Returns the weights (S, K) of control vertices (S, K) in vertices (S,) as a matrix (N, N)."""
     pairs = np.repeat(vertices, controls.shape[1]), controls.ravel()
     return scipy.sparse.csr_array((weights.ravel(), pairs), (n_vertices, n_vertices))
 
 
 def vertex_indices(values: ArrayLike, n_vertices: int, what: str) -> IntArray:
-    """Returns vertex indices (n,), or raises InputError for a mask, non-integers or indices out of range."""
+    """Returns vertex indices (n,), or raises InputError for a mask,
+    non-integers or indices out of range.
+    """
     indices = np.asarray(values).ravel()
     if indices.size and indices.dtype.kind not in "iu":
-        raise InputError(f"{what} must be vertex numbers: turn a mask into them with np.flatnonzero.")
+        raise InputError(
+            f"{what} must be vertex numbers: turn a mask into them with np.flatnonzero."
+        )
     if indices.size and (indices.min() < 0 or indices.max() >= n_vertices):
         raise InputError(f"{what} must lie between 0 and {n_vertices - 1}.")
     return indices.astype(np.int64)

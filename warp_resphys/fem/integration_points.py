@@ -1,8 +1,10 @@
-"""Finite elements as points: every integration rule is a list of points with a gradient operator and weights.
+"""Finite elements as points: every integration rule is a list of points
+with a gradient operator and weights.
 
-A *point* has the rest-space gradients of the shape functions of its cell's nodes, which give the deformation gradient
-``F = sum_a x_a (grad N_a)^T``, and its share of each element's volume in the shape term and in the volume term of the
-energy. Gauss points, element centres and averages over vertex patches all have this form.
+A *point* has the rest-space gradients of the shape functions of its cell's nodes, which give the
+deformation gradient ``F = sum_a x_a (grad N_a)^T``, and its share of each element's volume in the
+shape term and in the volume term of the energy. Gauss points, element centres and averages over
+vertex patches all have this form.
 """
 
 from collections.abc import Collection, Sequence
@@ -19,7 +21,8 @@ from ..mesh.volume_mesh import Mesh, check_mesh
 
 VolumeIntegration = Literal["centre", "full"]
 VOLUME_INTEGRATIONS: tuple[VolumeIntegration, ...] = get_args(VolumeIntegration)
-# Lode's parameter of a loading mode: tension extends one direction, compression (or biaxial tension) two.
+# Lode's parameter of a loading mode: tension extends one direction, compression (or biaxial
+# tension) two.
 LODE: Final = {"tension": -1.0, "shear": 0.0, "compression": 1.0}
 _ALIKE: Final = 0.05  # strain up to which all modes are alike
 _MOST_STATES = 400
@@ -30,8 +33,8 @@ class Points:
     """Cells with K nodes and Q points each; at a point, F = sum_a x_a g_a^T."""
 
     nodes: NDArray[np.int64]  # (C, K) vertex of each node of a cell
-    # (C, Q, K, 3) operators g_a; in a solid, gradients of the shape functions in rest space [1/m]. (C, Q, K, 1) where
-    # the energy is a function of a vector sum_a g_a x_a
+    # (C, Q, K, 3) operators g_a; in a solid, gradients of the shape functions in rest space [1/m].
+    # (C, Q, K, 1) where the energy is a function of a vector sum_a g_a x_a
     gradients: Array
 
     @property
@@ -53,7 +56,8 @@ class Points:
 class SolidPoints(Points):
     """Points of a solid."""
 
-    # (C Q, M) sparse; volume of each element that the point carries, in the shape term and in the volume term [m^3]
+    # (C Q, M) sparse; volume of each element that the point carries, in the shape term and in the
+    # volume term [m^3]
     shape_volume: scipy.sparse.csr_array
     volume_volume: scipy.sparse.csr_array
 
@@ -66,17 +70,25 @@ class Discretisation:
     element_volumes: Array  # (M,) [m^3]
     # (N, M) sparse; integral of N_a over each element [m^3]: consistent body forces
     load_volume: scipy.sparse.csr_array
-    lumped_volume: scipy.sparse.csr_array  # (N, M) sparse; positive lumping of each element's volume [m^3]: masses
+    lumped_volume: scipy.sparse.csr_array  # (N, M) sparse; positively lumped volumes [m^3]: masses
 
 
-def physical_gradients(vertices: Array, cells: NDArray[np.int64], reference_gradients: Array) -> tuple[Array, Array]:
-    """Returns rest-space gradients (C, Q, K, 3) [1/m] and Jacobian determinants (C, Q) [m^3] of isoparametric cells."""
+def physical_gradients(
+    vertices: Array, cells: NDArray[np.int64], reference_gradients: Array
+) -> tuple[Array, Array]:
+    """Returns rest-space gradients (C, Q, K, 3) [1/m]
+    and Jacobian determinants (C, Q) [m^3] of isoparametric cells.
+    """
     jacobian = np.einsum("cki,qkj->cqij", vertices[cells], reference_gradients)
-    return np.einsum("qkj,cqji->cqki", reference_gradients, np.linalg.inv(jacobian)), np.linalg.det(jacobian)
+    return np.einsum("qkj,cqji->cqki", reference_gradients, np.linalg.inv(jacobian)), np.linalg.det(
+        jacobian
+    )
 
 
 def volume_points(mesh: Mesh, cells: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Returns places (P, 3) [m] and volumes (P,) [m^3] of points by which to integrate polynomials over cells."""
+    """Returns places (P, 3) [m] and volumes (P,) [m^3] of points
+    by which to integrate polynomials over cells.
+    """
     points, weights = conical_simplex(4) if mesh.element.is_simplex else gauss_box(4)
     values, reference = mesh.element.shape(points)
     _, determinants = physical_gradients(mesh.vertices, mesh.cells[cells], reference)
@@ -94,25 +106,32 @@ def _one_hot(volumes: Array) -> scipy.sparse.csr_array:
 def _per_vertex(cells: NDArray[np.int64], n_vertices: int, values: Array) -> scipy.sparse.csr_array:
     """Returns the (N, M) matrix that sums values[m, a] into row cells[m, a], column m."""
     columns = np.repeat(np.arange(len(cells)), cells.shape[1])
-    return scipy.sparse.csr_array((values.ravel(), (cells.ravel(), columns)), shape=(n_vertices, len(cells)))
+    return scipy.sparse.csr_array(
+        (values.ravel(), (cells.ravel(), columns)), shape=(n_vertices, len(cells))
+    )
 
 
 def discretise(
-    mesh: Mesh, volume_integration: str = "centre", cells: NDArray[np.int64] | None = None, cracks: bool = False
+    mesh: Mesh,
+    volume_integration: str = "centre",
+    cells: NDArray[np.int64] | None = None,
+    cracks: bool = False,
 ) -> Discretisation:
     """Returns the points, masses and loads of a mesh, or of some of its cells.
 
-    The shape term uses the points of the element's rule. With ``centre``, the volume term is under-integrated against
-    locking, on deformation gradients projected on few polynomials per element (Simo and Hughes 1998, section 4.4):
-    constants, that is the volume-weighted mean, for 8-node hexahedra and 10-node tetrahedra, linear polynomials for
-    quadratic hexahedra; or on their mean over the cells around each vertex, for 4-node tetrahedra (Bonet and Burton
-    1998). Projections pass the patch test on distorted elements too (Flanagan and Belytschko 1981). With ``full``, the
-    volume term uses the points of the shape term.
+    The shape term uses the points of the element's rule. With ``centre``, the volume term is
+    under-integrated against locking, on deformation gradients projected on few polynomials per
+    element (Simo and Hughes 1998, section 4.4): constants, that is the volume-weighted mean, for
+    8-node hexahedra and 10-node tetrahedra, linear polynomials for quadratic hexahedra; or on their
+    mean over the cells around each vertex, for 4-node tetrahedra (Bonet and Burton 1998).
+    Projections pass the patch test on distorted elements too (Flanagan and Belytschko 1981). With
+    ``full``, the volume term uses the points of the shape term.
 
     Args:
         mesh: the rest shape.
         volume_integration: ``centre`` or ``full``.
-        cells: (M',) cell indices, all cells if omitted. Averages over patches are restricted to these cells.
+        cells: (M',) cell indices, all cells if omitted. Averages over patches are restricted to
+            these cells.
         cracks: whether vertices may coincide, like those of glued parts.
 
     Raises:
@@ -121,7 +140,8 @@ def discretise(
     """
     if volume_integration not in VOLUME_INTEGRATIONS:
         raise InputError(
-            f"volume_integration is {volume_integration!r}: choose one of {', '.join(VOLUME_INTEGRATIONS)}."
+            f"volume_integration is {volume_integration!r}: choose one of "
+            f"{', '.join(VOLUME_INTEGRATIONS)}."
         )
     if cells is not None:
         return _discretise_cells(mesh, volume_integration, cells, cracks)
@@ -132,7 +152,9 @@ def discretise(
     return _isoparametric(mesh, full)
 
 
-def _discretise_cells(mesh: Mesh, volume_integration: str, cells: NDArray[np.int64], cracks: bool) -> Discretisation:
+def _discretise_cells(
+    mesh: Mesh, volume_integration: str, cells: NDArray[np.int64], cracks: bool
+) -> Discretisation:
     """Returns the discretisation of a submesh, with the vertex numbers of the whole mesh."""
     used, renumbered = np.unique(mesh.cells[cells], return_inverse=True)
     part = Mesh(mesh.vertices[used], renumbered.reshape(-1, mesh.cells.shape[1]))
@@ -147,7 +169,7 @@ def _discretise_cells(mesh: Mesh, volume_integration: str, cells: NDArray[np.int
 
 
 def _isoparametric(mesh: Mesh, full: bool) -> Discretisation:
-    """Returns a discretisation with one rule for both terms, or projected gradients for the volume term."""
+    """A discretisation with one rule for both terms, or projected gradients for the volume term."""
     element = mesh.element
     points, weights = element.rule
     values, reference = element.shape(points)
@@ -173,11 +195,13 @@ def _isoparametric(mesh: Mesh, full: bool) -> Discretisation:
 
 
 def _projected(mesh: Mesh, points: Array, volumes: Array, gradients: Array) -> tuple[Array, Array]:
-    """Returns projected gradients (M, Q', K, 3) [1/m] and volumes (M, Q') [m^3] of the points of the volume term.
+    """Returns projected gradients (M, Q', K, 3) [1/m]
+    and volumes (M, Q') [m^3] of the points of the volume term.
 
-    The least-squares projection on the element's modes phi_n, by volume at the points of the shape term, is sum_n
-    phi_n(x) M^-1_nm sum_q v_q phi_m(x_q) g_q with M_nm = sum_q v_q phi_n(x_q) phi_m(x_q). The volumes of the rule are
-    corrected (smallest change) to integrate the modes as the points of the shape term do, which the patch test needs.
+    The least-squares projection on the element's modes phi_n, by volume at the points of the shape
+    term, is sum_n phi_n(x) M^-1_nm sum_q v_q phi_m(x_q) g_q with M_nm = sum_q v_q phi_n(x_q)
+    phi_m(x_q). The volumes of the rule are corrected (smallest change) to integrate the modes as
+    the points of the shape term do, which the patch test needs.
 
     Args:
         mesh: the mesh.
@@ -194,7 +218,9 @@ def _projected(mesh: Mesh, points: Array, volumes: Array, gradients: Array) -> t
     modes, there = (np.prod(x[:, None, :] ** element.volume_modes, axis=-1) for x in (points, at))
     gram = np.einsum("cq,qn,qm->cnm", volumes, modes, modes)
     moments = np.einsum("cq,qm,cqki->cmki", volumes, modes, gradients)
-    coefficients = np.linalg.solve(gram, moments.reshape(*moments.shape[:2], -1)).reshape(moments.shape)
+    coefficients = np.linalg.solve(gram, moments.reshape(*moments.shape[:2], -1)).reshape(
+        moments.shape
+    )
     _, determinants = physical_gradients(mesh.vertices, mesh.cells, element.shape(at)[1])
     corrected = determinants * weights
     missing = volumes @ modes - corrected @ there
@@ -203,9 +229,11 @@ def _projected(mesh: Mesh, points: Array, volumes: Array, gradients: Array) -> t
 
 
 def _hrz_lumping(mesh: Mesh, element_volumes: Array) -> Array:
-    """Returns volumes (M, K) in proportion to the diagonal of the consistent mass (Hinton, Rock, Zienkiewicz 1976).
+    """Returns volumes (M, K) in proportion to the diagonal
+    of the consistent mass (Hinton, Rock, Zienkiewicz 1976).
 
-    Row sums of quadratic elements may be negative at corners; these volumes are positive and sum to the element's.
+    Row sums of quadratic elements may be negative at corners; these volumes are positive and sum to
+    the element's.
     """
     assert mesh.element.mass_rule is not None
     points, weights = mesh.element.mass_rule
@@ -216,9 +244,14 @@ def _hrz_lumping(mesh: Mesh, element_volumes: Array) -> Array:
 
 
 def _linear_tetrahedra(mesh: Mesh, full: bool) -> Discretisation:
-    """Returns a discretisation with one point per cell for the shape term; these or vertex patches for the volume."""
+    """Returns a discretisation with one point per cell for the shape term.
+
+    These or vertex patches for the volume.
+    """
     points, weights = mesh.element.rule
-    gradients, determinants = physical_gradients(mesh.vertices, mesh.cells, mesh.element.shape(points)[1])
+    gradients, determinants = physical_gradients(
+        mesh.vertices, mesh.cells, mesh.element.shape(points)[1]
+    )
     volumes = determinants * weights  # (M, 1)
     n, m = len(mesh.vertices), len(mesh.cells)
     quarter = _per_vertex(mesh.cells, n, np.repeat(volumes / 4.0, 4, axis=1))
@@ -235,7 +268,7 @@ def _linear_tetrahedra(mesh: Mesh, full: bool) -> Discretisation:
 def mean_gradients(
     cells: NDArray[np.int64], gradients: Array, shares: scipy.sparse.csr_array
 ) -> tuple[NDArray[np.int64], Array]:
-    """Returns the mean gradient operator of the cells around each vertex, padded to the largest patch.
+    """Returns the mean gradient operator of cells around each vertex, padded to the largest patch.
 
     Args:
         cells: (M, K) vertices of each cell.
@@ -280,14 +313,15 @@ def padded_operators(
 
 
 def principal_stretches(mesh: Mesh, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the principal stretches at the centres of the cells, of at most 400 of the states, evenly chosen.
+    """Returns the principal stretches at centres of cells, of at most 400 of states, evenly chosen.
 
     Args:
         mesh: undeformed mesh of C cells.
         positions: (S, N, 3) vertices of some states [m].
 
     Returns:
-        (S', C, 3) singular values of the deformation gradient, descending; NaN where a position is not finite.
+        (S', C, 3) singular values of the deformation gradient, descending; NaN where a position is
+        not finite.
     """
     element = BY_NODES[mesh.cells.shape[1]]
     centre = element.shape.nodes[: element.nodes - len(element.parents)].mean(axis=0)
@@ -303,10 +337,12 @@ def principal_stretches(mesh: Mesh, positions: NDArray[np.float64]) -> NDArray[n
 def share_outside(
     stretches: NDArray[np.float64], between: Sequence[float], modes: Collection[str] = tuple(LODE)
 ) -> float:
-    """Returns the share of cells and states with a principal stretch outside of a range, or another loading mode.
+    """Returns the share of cells and states with a principal stretch outside of a range,
+    or another loading mode.
 
-    The mode is Lode's parameter (2 e_2 - e_1 - e_3) / (e_1 - e_3) of the logarithms e of the stretches, see `LODE`. It
-    may be half a step beyond those of the modes. Strains of up to 5 % are alike in all modes.
+    The mode is Lode's parameter (2 e_2 - e_1 - e_3) / (e_1 - e_3) of the logarithms e of the
+    stretches, see `LODE`. It may be half a step beyond those of the modes. Strains of up to 5 % are
+    alike in all modes.
 
     Args:
         stretches: (S, C, 3) principal stretches.

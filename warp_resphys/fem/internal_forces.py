@@ -1,22 +1,25 @@
-"""Internal forces of bodies, and what takes up their resultants: they weigh nothing and move no body as a whole.
+"""Internal forces of bodies, and what takes up their resultants:
+they weigh nothing and move no body as a whole.
 
-What a simulator lacks in material, walls and actuators acts within the body, so that its forces f_i at the vertices x_i
-have no resultant. Forces that are estimated from a few markers have one, and the clamp would carry it. A rigid motion
-with the twist t = (u, w) about a point c, with a length l, moves the vertices by J_i t = u + w x (x_i - c) / l; the
-resultant of the forces is the wrench
+What a simulator lacks in material, walls and actuators acts within the body, so that its forces f_i
+at the vertices x_i have no resultant. Forces that are estimated from a few markers have one, and
+the clamp would carry it. A rigid motion with the twist t = (u, w) about a point c, with a length l,
+moves the vertices by J_i t = u + w x (x_i - c) / l; the resultant of the forces is the wrench
 
     W = sum_i J_i^T f_i,
 
 whose last three components are the moment about c, over l.
 
-- Fixed vertices D return it. They exert g = J a with (sum_D J^T J) a = W beside their reaction r: of all forces with
-  this resultant the least ones, as in a group of equal bolts. Two small clamps share them by the law of the lever.
-  They change no motion, as fixed vertices do not move.
-- Rigid motions N that nothing hinders, all six of a free body, keep their momentum under f - m J N b with
-  (N^T sum m J^T J N) b = N^T W, for the masses m. Accelerations within the body stay as they are.
+- Fixed vertices D return it. They exert g = J a with (sum_D J^T J) a = W beside their reaction r:
+  of all forces with this resultant the least ones, as in a group of equal bolts. Two small clamps
+  share them by the law of the lever. They change no motion, as fixed vertices do not move.
+- Rigid motions N that nothing hinders, all six of a free body, keep their momentum under f - m J N
+  b with (N^T sum m J^T J N) b = N^T W, for the masses m. Accelerations within the body stay as they
+  are.
 - Symmetry planes cut a body; what they can exert is balanced by its other half.
 
-In derivatives, N is constant; it is so for free bodies, symmetry planes, and one or two fixed vertices that stay.
+In derivatives, N is constant; it is so for free bodies, symmetry planes, and one or two fixed
+vertices that stay.
 """
 
 from collections.abc import Iterator, Sequence
@@ -56,7 +59,9 @@ class _Supports:
 
     @classmethod
     def of(cls, body: Body, first: int, start: int, like: torch.Tensor) -> "_Supports":
-        """Returns the supports of a body, from its first vertex, and its first row among all fixed vertices."""
+        """Returns the supports of a body, from its first vertex,
+        and its first row among all fixed vertices.
+        """
         fixed, planes = body.fixed_vertices, body.coordinates
         length = float(np.ptp(body.vertices, axis=0).max())
         centre = body.vertices[fixed].mean(0) if len(fixed) else body.vertices.mean(0)
@@ -82,10 +87,14 @@ class _Supports:
     def moves(self, q: torch.Tensor, centre: torch.Tensor) -> torch.Tensor:
         """Returns J (B, n, 3, K) of the basis of twists, at vertices q (B, n, 3) [m]."""
         arms = (q - centre) / self.length
-        return self.twists[:3] + torch.linalg.cross(self.twists[3:].expand(*arms.shape, -1), arms[..., None], dim=-2)
+        return self.twists[:3] + torch.linalg.cross(
+            self.twists[3:].expand(*arms.shape, -1), arms[..., None], dim=-2
+        )
 
     def wrench(self, force: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-        """Returns W (B, K) of the forces of all vertices (B, N, 3) [N] by the basis of twists, at q (B, N, 3) [m]."""
+        """Returns W (B, K) of the forces of all vertices (B, N, 3) [N]
+        by the basis of twists, at q (B, N, 3) [m].
+        """
         acting, arms = force[:, self.vertices], (q[:, self.vertices] - self.centre(q)) / self.length
         moment = torch.linalg.cross(arms, acting).sum(1)
         return torch.cat([acting.sum(1), moment], 1) @ self.twists
@@ -96,19 +105,24 @@ class _Supports:
         return around.mean(1, keepdim=True)
 
     def free(self, stiffness: torch.Tensor) -> torch.Tensor:
-        """Returns N (B or 1, K, L), coefficients of the motions that nothing hinders, from J^T J (B, K, K) of D."""
+        """Returns N (B or 1, K, L), coefficients of the motions
+        that nothing hinders, from J^T J (B, K, K) of D.
+        """
         if not len(self.fixed):
             return torch.eye(self.loose).to(stiffness)[None]
         return torch.linalg.eigh(stiffness.detach()).eigenvectors[..., : self.loose]
 
     def at_fixed(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns J (B, D, 3, K) of the fixed vertices at positions (B, N, 3) [m], and sum_D J^T J (B, K, K)."""
+        """Returns J (B, D, 3, K) of the fixed vertices at positions (B, N, 3) [m],
+        and sum_D J^T J (B, K, K).
+        """
         moves = self.moves(q[:, self.fixed], self.centre(q))
         return moves, _gram(moves, moves)
 
 
 class InternalForces:
-    """Resultants of internal forces on the bodies of a simulator, each taken up by what holds its own body.
+    """Resultants of internal forces on the bodies of a simulator,
+    each taken up by what holds its own body.
 
     Args:
         body: a body, or a scene of several.
@@ -119,8 +133,12 @@ class InternalForces:
         self._supports = [*_supports(body, rest_positions)]
 
     def follow_pose(self, force: torch.Tensor | None) -> bool:
-        """Whether balanced forces depend on the pose: some (B, N, 3) act where nothing hinders a rigid motion."""
-        return force is not None and any(one.loose and bool(force[:, one.vertices].any()) for one in self._supports)
+        """Whether balanced forces depend on the pose:
+        some (B, N, 3) act where nothing hinders a rigid motion.
+        """
+        return force is not None and any(
+            one.loose and bool(force[:, one.vertices].any()) for one in self._supports
+        )
 
     def balanced(self, force: torch.Tensor, q: torch.Tensor, mass: torch.Tensor) -> torch.Tensor:
         """Returns forces without resultants along the motions that nothing hinders, differentiable.
@@ -128,7 +146,8 @@ class InternalForces:
         Args:
             force: (B, N, 3) [N].
             q: (B, N, 3) positions [m].
-            mass: (1 or B, N) [kg]; of a body whose vertices have none, such as a rigid one, all count alike.
+            mass: (1 or B, N) [kg]; of a body whose vertices have none, such as a rigid one, all
+                count alike.
         """
         parts, largest = [], mass.amax(1, keepdim=True)
         weight = (mass / torch.where(largest > 0.0, largest, 1.0)).clamp_min(_LEAST)

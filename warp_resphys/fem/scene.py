@@ -14,17 +14,20 @@ from ..stepping.inputs import Inputs
 from .bodies import Body, BodyEnergy
 from .coordinates import Coordinates
 
-_FIELDS = ("external_force", "internal_force", "fixed_positions", "attached_mass")  # inputs with one value per vertex
+# Inputs with one value per vertex.
+_FIELDS = ("external_force", "internal_force", "fixed_positions", "attached_mass")
 
 
 class Scene(Body):
     """Bodies in one simulator, with their vertices concatenated.
 
-    Names of parameters, inputs and memory variables are prefixed with the body's name, as in ``finger_tension``.
+    Names of parameters, inputs and memory variables are prefixed with the body's name, as in
+    ``finger_tension``.
 
     Args:
         bodies: bodies by name.
-        contact: contact of the bodies with one another and with themselves (`SurfaceContact`), or None.
+        contact: contact of the bodies with one another and with themselves (`SurfaceContact`), or
+            None.
 
     Raises:
         InputError: no body.
@@ -45,11 +48,15 @@ class Scene(Body):
     @override
     def __repr__(self) -> str:
         parts = [f"{name}: {body!r}" for name, body in self.bodies.items()]
-        return f"Scene({', '.join(parts)}{'' if self.contact is None else f', {type(self.contact).__name__}'})"
+        if self.contact is not None:
+            parts.append(type(self.contact).__name__)
+        return f"Scene({', '.join(parts)})"
 
     @cached_property
     def mesh(self) -> Mesh:
-        """The joined mesh; its regions are the bodies, and their regions under the names ``body_region``.
+        """The joined mesh.
+
+        Its regions are the bodies, and their regions under the names ``body_region``.
 
         Raises:
             MeshError: the bodies have different kinds of cells.
@@ -91,10 +98,14 @@ class Scene(Body):
 
     @override
     def moved(self, rotation: ArrayLike, translation: ArrayLike) -> "Scene":
-        return Scene({name: body.moved(rotation, translation) for name, body in self.bodies.items()}, self.contact)
+        return Scene(
+            {name: body.moved(rotation, translation) for name, body in self.bodies.items()},
+            self.contact,
+        )
 
     def vertex_slice(self, name: str) -> slice:
-        """Returns the range of a body's vertices in the scene, as in ``state.q[:, scene.vertex_slice("ball")]``.
+        """Returns the range of a body's vertices in the scene, as in ``state.q[:,
+        scene.vertex_slice("ball")]``.
 
         Raises:
             InputError: no body of that name.
@@ -110,19 +121,24 @@ class Scene(Body):
         Bodies without forces or attached masses get zeros.
 
         Raises:
-            InputError: no body of that name, or fixed positions of some bodies with fixed vertices but not of all.
+            InputError: no body of that name, or fixed positions of some bodies with fixed vertices
+                but not of all.
         """
         for name in by_body:
             self.vertex_slice(name)
         fields: dict[str, torch.Tensor | ArrayLike] = {}
         for key in _FIELDS:
             tensors_of = {
-                name: value for name, inputs in by_body.items() if (value := inputs.fields.get(key)) is not None
+                name: value
+                for name, inputs in by_body.items()
+                if (value := inputs.fields.get(key)) is not None
             }
             if not tensors_of:
                 continue
             axis = -1 if key == "attached_mass" else -2
-            tensors = [value for name, value in tensors_of.items() if key not in by_body[name].plain]
+            tensors = [
+                value for name, value in tensors_of.items() if key not in by_body[name].plain
+            ]
             sample = (tensors or [*tensors_of.values()])[0]
             tensors_of = {name: value.to(sample) for name, value in tensors_of.items()}
             for name, body in self.bodies.items():
@@ -130,15 +146,24 @@ class Scene(Body):
                     continue
                 size = len(body.fixed_vertices) if key == "fixed_positions" else body.n_vertices
                 if key == "fixed_positions" and size:
-                    raise InputError(f"fixed_positions of {name} are missing: give those of every body that has any.")
+                    raise InputError(
+                        f"fixed_positions of {name} are missing: "
+                        "give those of every body that has any."
+                    )
                 shape = [*sample.shape]
                 shape[axis] = size
                 tensors_of[name] = sample.new_zeros(shape)
             whole = torch.cat([tensors_of[name] for name in self.bodies], axis)
             fields[key] = whole if tensors else whole.numpy()
-        named = {f"{name}_{key}": value for name, inputs in by_body.items() for key, value in inputs.actuation.items()}
+        named = {
+            f"{name}_{key}": value
+            for name, inputs in by_body.items()
+            for key, value in inputs.actuation.items()
+        }
         out = Inputs(**named)
         out.plain |= {
-            f"{name}_{key}" for name, inputs in by_body.items() for key in inputs.plain & inputs.actuation.keys()
+            f"{name}_{key}"
+            for name, inputs in by_body.items()
+            for key in inputs.plain & inputs.actuation.keys()
         }
         return out.replace(**fields)

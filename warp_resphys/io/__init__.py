@@ -1,1 +1,3 @@
-"""Files, stages and workers: safe files, resumable work, progress, and worker processes here or on a cluster."""
+"""Files, stages and workers: safe files, resumable work, progress,
+and worker processes here or on a cluster.
+"""

@@ -14,7 +14,9 @@ IntArray = NDArray[np.int64]
 
 
 class Brief:
-    """Base of dataclasses whose `repr` has shapes in place of arrays, the first of long rows, and no empty fields."""
+    """Base of dataclasses whose `repr` has shapes in place of arrays,
+    the first of long rows, and no empty fields.
+    """
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Gives a class its representation before `dataclass` does, unless it has one."""
@@ -26,7 +28,11 @@ class Brief:
 def _brief(self: Any) -> str:
     """Returns the name of a dataclass and its fields."""
     given = {item.name: getattr(self, item.name) for item in fields(self)}
-    shown = (f"{name}={_SHAPES.repr(x)}" for name, x in given.items() if hasattr(x, "shape") or x not in (None, (), {}))
+    shown = (
+        f"{name}={_SHAPES.repr(x)}"
+        for name, x in given.items()
+        if hasattr(x, "shape") or x not in (None, (), {})
+    )
     return f"{type(self).__name__}({', '.join(shown)})"
 
 

@@ -1,9 +1,10 @@
-"""Classes of other packages in a configuration, in Hydra's notation: ``_target_`` and keyword arguments.
+"""Classes of other packages in a configuration, in Hydra's notation:
+``_target_`` and keyword arguments.
 
     energies: {magnet: {_target_: my_physics.Magnet, magnetisation: 60e3}}
 
-The arguments are checked by the annotations of the class, as the keys of settings are. A configuration may come from
-the file of a robot, so only a subclass of the expected base is called.
+The arguments are checked by the annotations of the class, as the keys of settings are. A
+configuration may come from the file of a robot, so only a subclass of the expected base is called.
 """
 
 import sys
@@ -22,17 +23,24 @@ from .settings import Settings, Word, parse
 
 
 class ClassSettings(Settings):
-    """A class of another package; the other keys are arguments of the class, or of its class method ``bind``."""
+    """A class of another package.
+
+    The other keys are arguments of the class, or of its class method ``bind``.
+    """
 
     model_config = ConfigDict(extra="allow", populate_by_name=True)
 
-    target: Word = Field(alias="_target_", description="module and class, such as my_physics.Magnet")
+    target: Word = Field(
+        alias="_target_", description="module and class, such as my_physics.Magnet"
+    )
 
     @override
     def packages(self) -> dict[str, str]:
         return package_of(self.target)
 
-    def factory(self, base: type[Any], where: str, leading: int = 0, method: str = "") -> Callable[..., Any]:
+    def factory(
+        self, base: type[Any], where: str, leading: int = 0, method: str = ""
+    ) -> Callable[..., Any]:
         """Returns the class, or a class method of it, with the arguments of the configuration.
 
         Args:
@@ -42,13 +50,18 @@ class ClassSettings(Settings):
             method: name of the class method; empty for the class itself.
 
         Raises:
-            InputError: the class cannot be imported, is no subclass, is abstract, or does not take these arguments.
+            InputError: the class cannot be imported, is no subclass, is abstract, or does not take
+                these arguments.
         """
         kind = imported(self.target, base, f"{where}: ")
         if missing := sorted(getattr(kind, "__abstractmethods__", ())):
-            raise InputError(f"{where}: {self.target} has no method {' and no '.join(missing)}: add it.")
+            raise InputError(
+                f"{where}: {self.target} has no method {' and no '.join(missing)}: add it."
+            )
         make = getattr(kind, method) if method else kind
-        values = {name: value for name, value in (self.model_extra or {}).items() if value is not None}
+        values = {
+            name: value for name, value in (self.model_extra or {}).items() if value is not None
+        }
         checked = parse(_arguments(make, leading, where), values, where)
         return partial(make, **{name: getattr(checked, name) for name in checked.model_fields_set})
 
@@ -73,13 +86,15 @@ def _arguments(make: Callable[..., Any], leading: int, where: str) -> type[_Argu
     except (NameError, PydanticUserError) as error:
         reason = str(error).partition(". ")[0]
         raise InputError(
-            f"{where}: the arguments of {make.__qualname__} cannot be given in a configuration ({reason}): annotate "
-            "them as numbers, words, lists or settings."
+            f"{where}: the arguments of {make.__qualname__} cannot be given in a configuration "
+            f"({reason}): annotate them as numbers, words, lists or settings."
         ) from error
 
 
 def imported(target: str, base: type[Any] | tuple[type[Any], ...], prefix: str = "") -> Any:
-    """Imports a class that is derived from another one, or from one of several; errors begin with a prefix.
+    """Imports a class that is derived from another one, or from one of several.
+
+    Errors begin with a prefix.
 
     Raises:
         InputError: it cannot be imported, or is something else.
@@ -91,8 +106,8 @@ def imported(target: str, base: type[Any] | tuple[type[Any], ...], prefix: str =
         found = getattr(import_module(module), name)
     except Exception as error:  # The module may raise anything.
         raise InputError(
-            f"{prefix}{target} cannot be imported ({type(error).__name__}: {error}): correct the name, or install or "
-            "correct the package."
+            f"{prefix}{target} cannot be imported ({type(error).__name__}: {error}): correct the "
+            "name, or install or correct the package."
         ) from error
     if not (isinstance(found, type) and issubclass(found, base)):
         bases = base if isinstance(base, tuple) else (base,)
@@ -102,8 +117,13 @@ def imported(target: str, base: type[Any] | tuple[type[Any], ...], prefix: str =
 
 
 def package_of(target: str) -> dict[str, str]:
-    """Returns name and version of the installed package that has a class; nothing where no package has it."""
-    return {name: version(name) for name in _packages(tuple(sys.path)).get(target.partition(".")[0], ())}
+    """Returns name and version of the installed package that has a class.
+
+    Nothing where no package has it.
+    """
+    return {
+        name: version(name) for name in _packages(tuple(sys.path)).get(target.partition(".")[0], ())
+    }
 
 
 @cache
@@ -121,17 +141,19 @@ def check_packages(packages: Mapping[str, str], where: object) -> None:
         where: the run or the file, for the message.
 
     Raises:
-        DataFileError: one is not installed, or in a version with other numbers before the second point.
+        DataFileError: one is not installed, or in a version with other numbers before the second
+            point.
     """
     for name, made in packages.items():
         try:
             here = version(name)
         except PackageNotFoundError:
             raise DataFileError(
-                f"{where} was made with {name} {made}, a package that is not installed: install it, then try again."
+                f"{where} was made with {name} {made}, a package that is not installed: install "
+                "it, then try again."
             ) from None
         if here.split(".")[:2] != made.split(".")[:2]:
             raise DataFileError(
-                f"{where} was made with {name} {made}, and this is {name} {here}: install the version that made it, or "
-                "make it again."
+                f"{where} was made with {name} {made}, and this is {name} {here}: install the "
+                "version that made it, or make it again."
             )

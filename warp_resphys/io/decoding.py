@@ -1,8 +1,8 @@
 """Decodes files of other programs in a subprocess with limits on memory and time.
 
-On a damaged file, ezc3d and HDF5 (C++ and C) can crash, loop or allocate gigabytes, and meshio can loop. This module
-is therefore also a program, which decodes one file and returns plain arrays. What it imports from the package takes no
-time.
+On a damaged file, ezc3d and HDF5 (C++ and C) can crash, loop or allocate gigabytes, and meshio can
+loop. This module is therefore also a program, which decodes one file and returns plain arrays. What
+it imports from the package takes no time.
 """
 
 import contextlib
@@ -49,17 +49,23 @@ def decode(library: str, path: Path, *names: str) -> Arrays:
         names: Further arguments of `hdf5_arrays`.
 
     Raises:
-        DecodingError: The library refuses the file, crashes, or exceeds the limits for a file of this size.
+        DecodingError: The library refuses the file, crashes, or exceeds the limits for a file of
+            this size.
     """
     size = path.stat().st_size
     memory, seconds = MEMORY[0] + MEMORY[1] * size, SECONDS[0] + SECONDS[1] * size
     limits = str(memory), str(np.ceil(seconds).astype(int))
     command = [sys.executable, "-P", "-m", __spec__.name, *limits, library, str(path), *names]
-    one_thread = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}  # each claims address space
+    # Each claims address space.
+    one_thread = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
     endless = f"decoding takes more than {seconds:.0f} s"
     try:
         done = subprocess.run(
-            command, capture_output=True, timeout=_WAITING * seconds, check=False, env={**os.environ, **one_thread}
+            command,
+            capture_output=True,
+            timeout=_WAITING * seconds,
+            check=False,
+            env={**os.environ, **one_thread},
         )
     except subprocess.TimeoutExpired as error:
         raise DecodingError(endless) from error
@@ -68,11 +74,14 @@ def decode(library: str, path: Path, *names: str) -> Arrays:
             return dict(archive)
     if done.returncode == 1:
         raise DecodingError(done.stderr.decode(errors="replace").strip())
-    raise DecodingError(endless if done.returncode == _OUT_OF_TIME else f"{library} ends with {done.returncode}")
+    raise DecodingError(
+        endless if done.returncode == _OUT_OF_TIME else f"{library} ends with {done.returncode}"
+    )
 
 
 def c3d_arrays(path: str) -> Arrays:
-    """Reads points (4, M, T), their labels, units and rate of a C3D file, and the labels of points that are no markers.
+    """Reads points (4, M, T), their labels, units and rate of a C3D file,
+    and the labels of points that are no markers.
 
     A parameter has at most 255 labels: LABELS2, LABELS3 and so on continue the list.
     """
@@ -80,8 +89,12 @@ def c3d_arrays(path: str) -> Arrays:
 
     file = ezc3d.c3d(path)
     point = file["parameters"]["POINT"]
-    parts = sorted((name for name in point if re.fullmatch(r"LABELS\d*", name)), key=lambda name: int(name[6:] or 1))
-    computed = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # model outputs of Vicon
+    parts = sorted(
+        (name for name in point if re.fullmatch(r"LABELS\d*", name)),
+        key=lambda name: int(name[6:] or 1),
+    )
+    # Model outputs of Vicon.
+    computed = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")
     texts = {
         "labels": [label for name in parts for label in point[name]["value"]],
         "units": point["UNITS"]["value"] if "UNITS" in point else [],
@@ -95,9 +108,12 @@ def c3d_arrays(path: str) -> Arrays:
 
 
 def hdf5_arrays(path: str, *names: str) -> Arrays:
-    """Reads datasets, with units, and attributes of an HDF5 file's root by name; missing ones are omitted.
+    """Reads datasets, with units, and attributes of an HDF5 file's root by name.
 
-    The units of the dataset "positions" are returned as "positions.units". h5py's own errors are not caught.
+    Missing ones are omitted.
+
+    The units of the dataset "positions" are returned as "positions.units". h5py's own errors are
+    not caught.
 
     Raises:
         DecodingError: The file refers to data elsewhere, or a value is neither numbers nor text.
@@ -122,7 +138,10 @@ def _plain(value: Any, name: str) -> NDArray[Any]:
     """Returns numbers unchanged, and text as an array of `numpy.str_`."""
     array = np.asarray(value)
     if array.dtype == object:
-        words = [word.decode(errors="replace") if isinstance(word, bytes) else str(word) for word in array.flat]
+        words = [
+            word.decode(errors="replace") if isinstance(word, bytes) else str(word)
+            for word in array.flat
+        ]
         return np.array(words, dtype=np.str_).reshape(array.shape)
     if array.dtype.hasobject:
         raise DecodingError(f"'{name}' contains neither numbers nor text")
@@ -143,7 +162,9 @@ def refuse_data_elsewhere(file: "h5py.File") -> None:
         seen.add(address)
         for name in group:
             item = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
-            if item is None or (isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)):
+            if item is None or (
+                isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)
+            ):
                 raise DecodingError(f"'{group.name.rstrip('/')}/{name}' refers to data elsewhere")
             if isinstance(item, h5py.Group):
                 groups.append(item)
@@ -153,7 +174,8 @@ def mesh_arrays(path: str, file_format: str | None = None) -> Arrays:
     """Reads points, volume cells, named surfaces and named regions (`mesh_blocks.mesh_arrays_of`).
 
     Args:
-        path: a file with one of `MESH_READERS`, or one that meshio reads, whose own errors are not caught.
+        path: a file with one of `MESH_READERS`, or one that meshio reads, whose own errors are not
+            caught.
         file_format: meshio's name of the format; None for that of the file name extension.
 
     Raises:
@@ -167,7 +189,9 @@ def mesh_arrays(path: str, file_format: str | None = None) -> Arrays:
     try:
         return mesh_arrays_of(*reader(path))
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-        raise DecodingError(f"the file is damaged or not whole ({error}); save the mesh again") from error
+        raise DecodingError(
+            f"the file is damaged or not whole ({error}); save the mesh again"
+        ) from error
 
 
 def _read_by_meshio(path: str, file_format: str | None) -> tuple[NDArray[np.float64], list[Block]]:
@@ -182,7 +206,11 @@ def _read_by_meshio(path: str, file_format: str | None) -> tuple[NDArray[np.floa
         raise DecodingError(printed.getvalue()) from error
     blocks = []
     for number, block in enumerate(content.cells):
-        sets = {name: cells[number] for name, cells in content.cell_sets.items() if cells[number] is not None}
+        sets = {
+            name: cells[number]
+            for name, cells in content.cell_sets.items()
+            if cells[number] is not None
+        }
         groups = {name: np.asarray(cells, dtype=np.int64) for name, cells in sets.items()}
         nodes = block.data if isinstance(block.data, np.ndarray) else np.empty((len(block), 0))
         blocks.append(Block(block.type, block.dim, nodes.astype(np.int64), groups))
@@ -194,14 +222,22 @@ def _limit(memory: int, seconds: int) -> None:
     with contextlib.suppress(ImportError):
         import resource
 
-        for kind, most in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, seconds), (resource.RLIMIT_CORE, 0)):
+        for kind, most in (
+            (resource.RLIMIT_AS, memory),
+            (resource.RLIMIT_CPU, seconds),
+            (resource.RLIMIT_CORE, 0),
+        ):
             hard = resource.getrlimit(kind)[1]
             with contextlib.suppress(ValueError, OSError):
-                resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+                resource.setrlimit(
+                    kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard)
+                )
 
 
 def _main(memory: str, seconds: str, library: str, path: str, *names: str) -> int:
-    """Decodes a file: writes its arrays to stdout and returns 0, or the reason of a failure to stderr and returns 1."""
+    """Decodes a file: writes its arrays to stdout and returns 0,
+    or the reason of a failure to stderr and returns 1.
+    """
     _limit(int(memory), int(seconds))
     answer, reason = (os.fdopen(os.dup(stream), "wb") for stream in (1, 2))
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -228,7 +264,11 @@ def decoded(library: str, path: str, *names: str) -> Arrays:
         DecodingError: The library refuses the file.
         MemoryError: The file claims more memory than there is.
     """
-    decoders: dict[str, Callable[..., Arrays]] = {"ezc3d": c3d_arrays, "meshio": mesh_arrays, "h5py": hdf5_arrays}
+    decoders: dict[str, Callable[..., Arrays]] = {
+        "ezc3d": c3d_arrays,
+        "meshio": mesh_arrays,
+        "h5py": hdf5_arrays,
+    }
     try:
         return decoders[library](path, *names)
     except MemoryError:

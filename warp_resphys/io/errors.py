@@ -1,4 +1,7 @@
-"""Errors that the user can fix: each is one sentence, and the command line exits with code 2; and warnings."""
+"""Errors that the user can fix: each is one sentence, and the command line exits with code 2.
+
+And warnings.
+"""
 
 import difflib
 import inspect
@@ -60,9 +63,11 @@ T = TypeVar("T")
 
 
 class ResphysError(Exception):
-    """Base of all errors whose message is written for the user: what was wrong, where, and what to do.
+    """Base of all errors whose message is written for the user:
+    what was wrong, where, and what to do.
 
-    Messages may quote files and libraries; they are reduced to one line of limited length without control characters.
+    Messages may quote files and libraries; they are reduced to one line of limited length without
+    control characters.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -71,7 +76,10 @@ class ResphysError(Exception):
 
 
 class ResphysWarning(UserWarning):
-    """Values that can be simulated and look like a mistake; `warnings.filterwarnings` with this class silences them."""
+    """Values that can be simulated and look like a mistake.
+
+    `warnings.filterwarnings` with this class silences them.
+    """
 
 
 class InputError(ResphysError, ValueError):
@@ -91,7 +99,9 @@ class DataFileError(ResphysError):
 
 
 class DerivativeError(ResphysError, RuntimeError):
-    """A derivative that a simulation does not have: of second order, in forward mode, or by ``torch.func``."""
+    """A derivative that a simulation does not have:
+    of second order, in forward mode, or by ``torch.func``.
+    """
 
 
 class DecodingError(Exception):
@@ -115,7 +125,9 @@ class ConvergenceError(ResphysError, RuntimeError):
 def warn(message: str) -> None:
     """Issues a `ResphysWarning` at the line of the user's program that led to it."""
     package, depth, frame = __name__.partition(".")[0], 2, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(f"{package}."):
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(
+        f"{package}."
+    ):
         frame, depth = frame.f_back, depth + 1
     warnings.warn(message, ResphysWarning, stacklevel=depth)
 
@@ -127,11 +139,19 @@ def listed(names: Sequence[str]) -> str:
 
 def number_of(count: int, what: str) -> str:
     """Returns a number of things: "1 trial", "2 trials", "2 rigid bodies"."""
-    return f"{count} {what}" if count == 1 else f"{count} {what[:-1]}ies" if what.endswith("y") else f"{count} {what}s"
+    return (
+        f"{count} {what}"
+        if count == 1
+        else f"{count} {what[:-1]}ies"
+        if what.endswith("y")
+        else f"{count} {what}s"
+    )
 
 
 def did_you_mean(wanted: str, known: Sequence[str], preferred: Sequence[str] = ()) -> str:
-    """Returns ", did you mean ...?" with the names most similar to an unknown one; empty if none is similar.
+    """Returns ", did you mean ...?" with the names most similar to an unknown one.
+
+    Empty if none is similar.
 
     Args:
         wanted: the unknown name.
@@ -139,7 +159,9 @@ def did_you_mean(wanted: str, known: Sequence[str], preferred: Sequence[str] = (
         preferred: existing names that are offered in any case.
     """
     offered = [name for name in dict.fromkeys(preferred) if name != wanted][:3]
-    matches = offered or difflib.get_close_matches(wanted, [name for name in known if name != wanted], n=3, cutoff=0.6)
+    matches = offered or difflib.get_close_matches(
+        wanted, [name for name in known if name != wanted], n=3, cutoff=0.6
+    )
     return f", did you mean {' or '.join(repr(match) for match in matches)}?" if matches else ""
 
 
@@ -154,7 +176,10 @@ def naming(group: str) -> Iterator[None]:
 
 @contextmanager
 def needs_extra(extra: str, what: str) -> Iterator[None]:
-    """Raises one sentence where an import fails, with the extra to install; ``what`` as in "the viewer needs"."""
+    """Raises one sentence where an import fails, with the extra to install.
+
+    ``what`` as in "the viewer needs".
+    """
     try:
         yield
     except ImportError as error:
@@ -166,18 +191,24 @@ def needs_extra(extra: str, what: str) -> Iterator[None]:
 
 
 def checks_types(function: Callable[P, R]) -> Callable[P, R]:
-    """Returns a function that raises InputError for arguments of other types, places or names than it declares."""
+    """Returns a function that raises InputError for arguments of other types,
+    places or names than it declares.
+    """
     signature, called = inspect.signature(function), function.__qualname__.removesuffix(".__init__")
     hints = cache(lambda: get_type_hints(function))
     several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    checked = [name for name, parameter in signature.parameters.items() if parameter.kind not in several]
+    checked = [
+        name for name, parameter in signature.parameters.items() if parameter.kind not in several
+    ]
 
     @wraps(function)
     def call(*given: P.args, **options: P.kwargs) -> R:
         try:
             arguments = signature.bind(*given, **options).arguments
         except TypeError as error:
-            declared = ", ".join(name for name in signature.parameters if name not in ("self", "cls"))
+            declared = ", ".join(
+                name for name in signature.parameters if name not in ("self", "cls")
+            )
             raise InputError(f"{called}: {error}: its arguments are {declared}.") from None
         for name in checked:
             if name in arguments and name in hints():
@@ -199,7 +230,9 @@ def checks_methods(*names: str) -> Callable[[type[T]], type[T]]:
 
 
 def check_fields(instance: Any) -> None:
-    """Raises InputError for a field of a dataclass of another type than it declares, if that is a class or a list."""
+    """Raises InputError for a field of a dataclass of another type than it declares,
+    if that is a class or a list.
+    """
     for name, hint in _fields_of(instance.__class__).items():
         check_type(f"{type(instance).__name__}: {name}", getattr(instance, name), hint)
 
@@ -211,7 +244,9 @@ def _fields_of(kind: Any) -> dict[str, Any]:
 
 
 def check_type(name: str, value: object, hint: Any) -> None:
-    """Raises InputError for a value that a type hint excludes, also in lists and mappings of a class."""
+    """Raises InputError for a value that a type hint excludes,
+    also in lists and mappings of a class.
+    """
     if type(value) is hint:
         return
     if get_origin(hint) is Literal:
@@ -219,28 +254,41 @@ def check_type(name: str, value: object, hint: Any) -> None:
             raise InputError(f"{name} is {value!r}: choose {' or '.join(get_args(hint))}.")
         return
     parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    kinds: list[Any] = [Mapping if is_typeddict(part) else get_origin(part) or part for part in parts]
+    kinds: list[Any] = [
+        Mapping if is_typeddict(part) else get_origin(part) or part for part in parts
+    ]
     if object in kinds or Any in kinds or not all(map(_decides, kinds)):
         return
     groups = [part for part, kind in zip(parts, kinds, strict=True) if kind in (Sequence, Mapping)]
     if any(kind.__module__.startswith("numpy.") for kind in kinds):  # of ArrayLike
-        kinds = [kind for kind in kinds if kind in (str, NoneType) or kind.__module__.startswith("warp_")] + [_Array]
+        kinds = [
+            kind for kind in kinds if kind in (str, NoneType) or kind.__module__.startswith("warp_")
+        ] + [_Array]
     letters = isinstance(value, str) and str not in kinds  # which are no list of names
-    rows = getattr(value, "shape", ()) != () and {*kinds} <= {int, float, bool, str, NoneType}  # which are no number
+    # Which are no number.
+    rows = getattr(value, "shape", ()) != () and {*kinds} <= {int, float, bool, str, NoneType}
     if letters or rows or not isinstance(value, tuple(_WIDER.get(kind, kind) for kind in kinds)):
         words = " or ".join(dict.fromkeys(map(_word, kinds)))
         raise InputError(f"{name} is {in_short(value)}: it must be {words}.")
     item_kind = get_args(groups[0])[-1] if len(groups) == 1 and get_args(groups[0]) else None
     if not isinstance(item_kind, type) or item_kind.__module__ == "builtins":
         return
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list | tuple) else ()
+    items = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list | tuple)
+        else ()
+    )
     for key, item in items:
         check_type(f"{name}[{key!r}]", item, item_kind)
 
 
 def _decides(kind: Any) -> bool:
     """Whether a value can be asked for its type."""
-    is_checked = getattr(kind, "_is_runtime_protocol", False) or not getattr(kind, "_is_protocol", False)
+    is_checked = getattr(kind, "_is_runtime_protocol", False) or not getattr(
+        kind, "_is_protocol", False
+    )
     return kind in _WIDER or (isinstance(kind, type) and is_checked)
 
 
@@ -254,4 +302,8 @@ def _word(kind: Any) -> str:
 def in_short(value: object) -> str:
     """Returns what a value is, for a message: the shape of an array, otherwise its type."""
     shape = getattr(value, "shape", None)
-    return f"of type {type(value).__name__}" if not isinstance(shape, tuple) else f"an array of shape {tuple(shape)}"
+    return (
+        f"of type {type(value).__name__}"
+        if not isinstance(shape, tuple)
+        else f"an array of shape {tuple(shape)}"
+    )

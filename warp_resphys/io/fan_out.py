@@ -32,7 +32,8 @@ _ATTEMPTS = 3
 _IDLE_SECONDS = 60.0  # after which an idle local worker ends
 _ANSWER_SECONDS = 10.0  # timeout of the connection to a cluster
 _PARENT_SECONDS = 0.02  # interval at which a worker checks that its parent process lives
-_LOST = {"BrokenProcessPool", "KilledWorker", "CommClosedError"}  # errors that mean that a worker is lost
+# Errors that mean that a worker is lost.
+_LOST = {"BrokenProcessPool", "KilledWorker", "CommClosedError"}
 
 
 class WorkerError(ResphysError, RuntimeError):
@@ -75,7 +76,9 @@ def fan_out(
     folder: Path,
     finished: Callable[[int], None] = lambda number: None,
 ) -> list[Any]:
-    """Calls a function for every task in worker processes; returns the results in the order of the tasks.
+    """Calls a function for every task in worker processes.
+
+    Returns the results in the order of the tasks.
 
     Args:
         function: of a task; a module-level function, as it is pickled for the workers.
@@ -86,7 +89,8 @@ def fan_out(
 
     Raises:
         InputError: Dask is not installed, or the cluster does not answer.
-        WorkerError: a task raised a ResphysError, whose message is kept, or workers were lost repeatedly.
+        WorkerError: a task raised a ResphysError, whose message is kept, or workers were lost
+            repeatedly.
         WorkerFaultError: a task raised another error.
     """
     results: dict[int, Any] = {}
@@ -95,7 +99,10 @@ def fan_out(
         if not left:
             break
         try:
-            with ends_as_after_ctrl_c(), _local(workers) if workers.address is None else _dask(workers.address):
+            with (
+                ends_as_after_ctrl_c(),
+                _local(workers) if workers.address is None else _dask(workers.address),
+            ):
                 # With n_jobs=1, joblib would work in this process.
                 parallel = Parallel(
                     n_jobs=max(workers.count, 2),
@@ -103,7 +110,9 @@ def fan_out(
                     batch_size=1,
                     return_as="generator_unordered",
                 )
-                for number, result in parallel(delayed(_work)(function, *numbered, folder) for numbered in left):
+                for number, result in parallel(
+                    delayed(_work)(function, *numbered, folder) for numbered in left
+                ):
                     results[number] = result
                     finished(number)
         except Exception as error:
@@ -111,11 +120,14 @@ def fan_out(
                 raise
             if attempt == _ATTEMPTS:
                 raise WorkerError(
-                    f"worker processes were killed {attempt} times in a row, perhaps because memory ran out "
-                    f"({type(error).__name__}): run the same command again, with fewer processes."
+                    f"worker processes were killed {attempt} times in a row, perhaps because "
+                    f"memory ran out ({type(error).__name__}): "
+                    "run the same command again, with fewer processes."
                 ) from error
             workers = workers.at_most(workers.count // 2) if workers.address is None else workers
-            log.warning("a worker process was lost: its work is repeated, %d tasks at once", workers.count)
+            log.warning(
+                "a worker process was lost: its work is repeated, %d tasks at once", workers.count
+            )
     return [results[number] for number in range(len(tasks))]
 
 
@@ -125,7 +137,8 @@ def _work(function: Callable[[Any], Any], number: int, task: Any, folder: Path) 
     _begin_work()
     if not folder.is_dir():
         raise WorkerError(
-            f"the worker on {socket.gethostname()} cannot access {folder}: choose a run folder that all workers share."
+            f"the worker on {socket.gethostname()} cannot access {folder}: choose a run folder "
+            "that all workers share."
         )
     try:
         with threadpool_limits(1):
@@ -137,7 +150,9 @@ def _work(function: Callable[[Any], Any], number: int, task: Any, folder: Path) 
 
 
 def _begin_work() -> None:
-    """Prepares a worker process: one thread of torch, and no warnings that the parent process has shown."""
+    """Prepares a worker process: one thread of torch,
+    and no warnings that the parent process has shown.
+    """
     warnings.simplefilter("ignore", ResphysWarning)
     torch.set_num_threads(1)
     os.environ["WARP_RESPHYS_THREADS"] = "1"
@@ -171,12 +186,21 @@ def _end_with(parent: int) -> None:
 @contextmanager
 def _local(workers: Workers) -> Iterator[None]:
     ends = {"initializer": _end_with, "initargs": (os.getpid(),)}
-    with warnings.catch_warnings(), parallel_config("loky", idle_worker_timeout=_IDLE_SECONDS, **ends):
-        # loky replaces a worker that ended because it was idle or its memory had grown, and warns of that.
-        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor")
+    with (
+        warnings.catch_warnings(),
+        parallel_config("loky", idle_worker_timeout=_IDLE_SECONDS, **ends),
+    ):
+        # loky replaces a worker that ended because it was idle or its memory had grown, and warns
+        # of that.
+        warnings.filterwarnings(
+            "ignore", "A worker stopped while some jobs were given to the executor"
+        )
         with interrupts_blocked():
-            # loky ends a worker whose memory grows by 300 MB after its first call, which hence has all imports.
-            Parallel(n_jobs=max(workers.count, 2))(delayed(_begin_work)() for _ in range(workers.count))
+            # loky ends a worker whose memory grows by 300 MB after its first call, which hence has
+            # all imports.
+            Parallel(n_jobs=max(workers.count, 2))(
+                delayed(_begin_work)() for _ in range(workers.count)
+            )
         yield
 
 
@@ -189,10 +213,12 @@ def _dask(address: str) -> Iterator[None]:
         client = Client(address, timeout=_ANSWER_SECONDS)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"no Dask cluster answers at parallel.address={address}: start it, correct the address, or omit it to use "
-            "processes of this machine."
+            f"no Dask cluster answers at parallel.address={address}: start it, correct the "
+            "address, or omit it to use processes of this machine."
         ) from error
     with client, parallel_config("dask"):
         if any(threads != 1 for threads in client.nthreads().values()):
-            raise InputError("a worker of the Dask cluster has several threads: start each with --nthreads 1.")
+            raise InputError(
+                "a worker of the Dask cluster has several threads: start each with --nthreads 1."
+            )
         yield

@@ -1,7 +1,9 @@
-"""Reads meshes of gmsh: MSH 2, 4.0 and 4.1, as text or binary (https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format).
+"""Reads meshes of gmsh: MSH 2, 4.0 and 4.1, as text or binary
+(https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format).
 
-An entity of geometry can be in several physical groups. MSH 4 lists the groups of each entity; MSH 2 repeats its cells
-for each of them, which are read once. Only groups with a name are read. Other sections, such as $Periodic, are ignored.
+An entity of geometry can be in several physical groups. MSH 4 lists the groups of each entity; MSH
+2 repeats its cells for each of them, which are read once. Only groups with a name are read. Other
+sections, such as $Periodic, are ignored.
 """
 
 import re
@@ -18,10 +20,32 @@ from .text import decoded
 Names = Mapping[tuple[int, int], str]  # of physical groups by dimension and number
 
 _KINDS = {  # meshio's name, dimension and number of nodes by gmsh's number of a kind
-    **{1: ("line", 1, 2), 2: ("triangle", 2, 3), 3: ("quad", 2, 4), 4: ("tetra", 3, 4), 5: ("hexahedron", 3, 8)},
-    **{6: ("wedge", 3, 6), 7: ("pyramid", 3, 5), 8: ("line3", 1, 3), 9: ("triangle6", 2, 6), 10: ("quad9", 2, 9)},
-    **{11: ("tetra10", 3, 10), 12: ("hexahedron27", 3, 27), 13: ("wedge18", 3, 18), 14: ("pyramid14", 3, 14)},
-    **{15: ("vertex", 0, 1), 16: ("quad8", 2, 8), 17: ("hexahedron20", 3, 20), 18: ("wedge15", 3, 15)},
+    **{
+        1: ("line", 1, 2),
+        2: ("triangle", 2, 3),
+        3: ("quad", 2, 4),
+        4: ("tetra", 3, 4),
+        5: ("hexahedron", 3, 8),
+    },
+    **{
+        6: ("wedge", 3, 6),
+        7: ("pyramid", 3, 5),
+        8: ("line3", 1, 3),
+        9: ("triangle6", 2, 6),
+        10: ("quad9", 2, 9),
+    },
+    **{
+        11: ("tetra10", 3, 10),
+        12: ("hexahedron27", 3, 27),
+        13: ("wedge18", 3, 18),
+        14: ("pyramid14", 3, 14),
+    },
+    **{
+        15: ("vertex", 0, 1),
+        16: ("quad8", 2, 8),
+        17: ("hexahedron20", 3, 20),
+        18: ("wedge15", 3, 15),
+    },
     **{19: ("pyramid13", 3, 13)},
 }
 _HEXAHEDRON20 = [*range(9), 11, 13, 9, 16, 18, 19, 17, 10, 12, 14, 15]
@@ -41,12 +65,19 @@ class _Numbers:
         self._order, self._at = order, 0
 
     def rows(self, count: int, kinds: str) -> FloatArray:
-        """Returns the next rows (count, k); in binary files of the kinds i and q, integers of 4 and 8 bytes, and d."""
+        """Returns the next rows (count, k).
+
+        In binary files of the kinds i and q, integers of 4 and 8 bytes, and d.
+        """
         if isinstance(self._content, bytes):
-            kind = np.dtype([(str(number), self._order + letter) for number, letter in enumerate(kinds)])
+            kind = np.dtype(
+                [(str(number), self._order + letter) for number, letter in enumerate(kinds)]
+            )
             taken = np.frombuffer(self._content, kind, count, self._at)
             self._at += taken.nbytes
-            return np.stack([taken[name].astype(np.float64) for name in taken.dtype.names or ()], axis=1)
+            return np.stack(
+                [taken[name].astype(np.float64) for name in taken.dtype.names or ()], axis=1
+            )
         end = self._at + count * len(kinds)
         if end > len(self._content):
             raise DecodingError("the file is not whole; save it again")
@@ -68,7 +99,9 @@ def read_gmsh(path: str) -> tuple[FloatArray, list[Block]]:
     """
     sections = _sections(Path(path).read_bytes())
     if "MeshFormat" not in sections:
-        raise DecodingError("the file has no $MeshFormat; save the mesh by gmsh as version 4.1 or 2.2")
+        raise DecodingError(
+            "the file has no $MeshFormat; save the mesh by gmsh as version 4.1 or 2.2"
+        )
     version, binary = re.split(rb"\s+", sections["MeshFormat"].strip())[:2]
     number, is_text = float(version), binary == b"0"
     mark = sections["MeshFormat"].partition(b"\n")[2][:4]
@@ -80,13 +113,22 @@ def read_gmsh(path: str) -> tuple[FloatArray, list[Block]]:
     if 2.0 <= number < 3.0:
         return _version_2(sections, names, is_text, order)
     if not 4.0 <= number <= 4.1:
-        raise DecodingError(f"version {number:g} of gmsh's format is not read; save the mesh as version 4.1 or 2.2")
+        raise DecodingError(
+            f"version {number:g} of gmsh's format is not read; save the mesh as version 4.1 or 2.2"
+        )
     used = ("Entities", "PartitionedEntities", "Nodes", "Elements")
-    return _version_4({key: _Numbers(sections[key], is_text, order) for key in used if key in sections}, number, names)
+    return _version_4(
+        {key: _Numbers(sections[key], is_text, order) for key in used if key in sections},
+        number,
+        names,
+    )
 
 
 def _sections(content: bytes) -> dict[str, bytes]:
-    """Returns the content of the sections by name; of a section without an end, all that follows."""
+    """Returns the content of the sections by name.
+
+    Of a section without an end, all that follows.
+    """
     sections, at = dict[str, bytes](), 0
     while head := _HEAD.search(content, at):
         end = content.find(b"$End" + head[1], head.end())
@@ -95,7 +137,9 @@ def _sections(content: bytes) -> dict[str, bytes]:
     return sections
 
 
-def _version_4(sections: Mapping[str, _Numbers], version: float, names: Names) -> tuple[FloatArray, list[Block]]:
+def _version_4(
+    sections: Mapping[str, _Numbers], version: float, names: Names
+) -> tuple[FloatArray, list[Block]]:
     """Reads a file of version 4.0 or 4.1, whose blocks belong to one entity each."""
     groups: dict[tuple[int, int], IntArray] = {}
     for key in ("Entities", "PartitionedEntities"):
@@ -109,14 +153,18 @@ def _version_4(sections: Mapping[str, _Numbers], version: float, names: Names) -
         name, _, nodes = _kind(kind)
         count = elements.count()
         cells = elements.rows(count, (1 + nodes) * ("q" if is_new else "i"))[:, 1:].astype(np.int64)
-        named = [names.get((dimension, abs(group))) for group in groups.get((dimension, entity), ())]
+        named = [
+            names.get((dimension, abs(group))) for group in groups.get((dimension, entity), ())
+        ]
         members = {group: np.arange(count) for group in named if group is not None}
         cells = rows_of(numbers, cells)[:, _ORDERS.get(name, slice(None))]
         blocks.append(Block(name, int(dimension), cells, members))
     return points, blocks
 
 
-def _entities(numbers: _Numbers, is_partitioned: bool, version: float) -> dict[tuple[int, int], IntArray]:
+def _entities(
+    numbers: _Numbers, is_partitioned: bool, version: float
+) -> dict[tuple[int, int], IntArray]:
     """Returns the physical groups of entities by their dimension and number."""
     groups = {}
     if is_partitioned:
@@ -187,11 +235,13 @@ def _version_2(
             cells.setdefault(kind, []).append([abs(group), *values[start : start + nodes]])
             at = start + nodes
         left -= count
-    return points, [_once(kind, np.array(rows, dtype=np.int64), names, tags) for kind, rows in cells.items()]
+    return points, [
+        _once(kind, np.array(rows, dtype=np.int64), names, tags) for kind, rows in cells.items()
+    ]
 
 
 def _once(number: int, rows: IntArray, names: Names, tags: IntArray) -> Block:
-    """Returns a block of cells from rows (m, 1 + k) of a group and nodes, and the same nodes once."""
+    """A block of cells from rows (m, 1 + k) of a group and nodes, and the same nodes once."""
     kind, dimension, _ = _kind(number)
     _, first, cell = np.unique(rows[:, 1:], axis=0, return_index=True, return_inverse=True)
     _, pair = np.unique(np.stack([rows[:, 0], cell.ravel()]), axis=1, return_index=True)
@@ -209,5 +259,7 @@ def _once(number: int, rows: IntArray, names: Names, tags: IntArray) -> Block:
 
 def _kind(number: int) -> tuple[str, int, int]:
     if number not in _KINDS:
-        raise DecodingError(f"cells of gmsh's kind {number} are above order 2; set Mesh.ElementOrder to 1 or 2")
+        raise DecodingError(
+            f"cells of gmsh's kind {number} are above order 2; set Mesh.ElementOrder to 1 or 2"
+        )
     return _KINDS[number]

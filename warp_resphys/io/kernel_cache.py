@@ -1,4 +1,6 @@
-"""Warp's cache of compiled kernels: a temporary folder if Warp's own is not writable, as in many containers."""
+"""Warp's cache of compiled kernels: a temporary folder
+if Warp's own is not writable, as in many containers.
+"""
 
 import atexit
 import os
@@ -48,7 +50,9 @@ def ensure_kernel_cache() -> None:
     if cache is None:
         if sys.platform != "linux":
             return
-        cache = os.path.join(os.environ.get("XDG_CACHE_HOME", os.path.expanduser("~/.cache")), "warp")
+        cache = os.path.join(
+            os.environ.get("XDG_CACHE_HOME", os.path.expanduser("~/.cache")), "warp"
+        )
     folder = Path(cache)
     if folder.name != wp.config.version:
         folder /= wp.config.version
@@ -64,11 +68,13 @@ def ensure_kernel_cache() -> None:
         for kernels in folder.glob("wp_warp_resphys*"):
             shutil.copytree(kernels, Path(temporary, wp.config.version, kernels.name))
     except OSError:
-        raise InputError(f"{reason}, nor is a temporary one: set WARP_CACHE_PATH to a writable folder.") from None
+        raise InputError(
+            f"{reason}, nor is a temporary one: set WARP_CACHE_PATH to a writable folder."
+        ) from None
     wp.config.kernel_cache_dir = os.environ["WARP_CACHE_PATH"] = temporary
     print(
-        f"warning: {reason}: kernels are compiled into a temporary folder in every run; set WARP_CACHE_PATH to a "
-        "writable folder.",
+        f"warning: {reason}: kernels are compiled into a temporary folder in every run; set "
+        "WARP_CACHE_PATH to a writable folder.",
         file=sys.stderr,
         flush=True,
     )

@@ -64,16 +64,28 @@ def made_on() -> dict[str, str]:
 
 
 def commit() -> str | None:
-    """Commit of the running code, with "and changes" if files differ; None outside a git repository."""
+    """Commit of the running code, with "and changes" if files differ.
+
+    None outside a git repository.
+    """
     folder = Path(__file__).parent
-    if shutil.which("git") is None or _git(folder, "ls-files", "--error-unmatch", Path(__file__).name) is None:
+    if (
+        shutil.which("git") is None
+        or _git(folder, "ls-files", "--error-unmatch", Path(__file__).name) is None
+    ):
         return None
     name = _git(folder, "rev-parse", "--short=10", "HEAD")
-    return f"{name} and changes" if _git(folder, "status", "--porcelain", "--untracked-files=no") else name
+    return (
+        f"{name} and changes"
+        if _git(folder, "status", "--porcelain", "--untracked-files=no")
+        else name
+    )
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    result = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=False)
+    result = subprocess.run(
+        ["git", *arguments], cwd=folder, capture_output=True, text=True, check=False
+    )
     return result.stdout.strip() if result.returncode == 0 else None
 
 
@@ -84,11 +96,16 @@ def peak_memory_gib() -> float:
         return peaks[0] / 2**20
     if resource is None:
         return 0.0
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
+        2**30 if sys.platform == "darwin" else 2**20
+    )
 
 
 def available_memory_gib() -> float:
-    """Memory that this process may still use [GiB]: free memory within a container's limit; infinite if unknown."""
+    """Memory that this process may still use [GiB]: free memory within a container's limit.
+
+    Infinite if unknown.
+    """
     limits = [kibibytes / 2**20 for kibibytes in _kibibytes("/proc/meminfo", "MemAvailable")]
     limit = Path("/sys/fs/cgroup/memory.max")
     if limit.is_file() and (text := limit.read_text().strip()).isdigit():

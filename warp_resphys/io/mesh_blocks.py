@@ -1,4 +1,4 @@
-"""Blocks of cells as mesh files have them, and the arrays that `decoding.decode` returns of them."""
+"""Blocks of cells as mesh files have them, and arrays that `decoding.decode` returns of them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from .arrays import FloatArray, IntArray
 from .errors import DecodingError
 
-_CORNERS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}  # of the faces that can have a name
+# Of the faces that can have a name.
+_CORNERS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}
 
 
 class Block(NamedTuple):
@@ -25,9 +26,10 @@ def mesh_arrays_of(points: FloatArray, blocks: Sequence[Block]) -> dict[str, NDA
     """Sorts blocks into volume cells, named surfaces and named regions.
 
     Returns:
-        `points` (N, 3); `types`, names of all kinds of cells; `solid/KIND` (M, k), the volume cells of a kind;
-        `surface/NAME` (F, 4), the corners of the faces of a named surface, the last one twice in triangles; and
-        `region/NAME` (m,), the numbers of the volume cells of a named region.
+        `points` (N, 3); `types`, names of all kinds of cells; `solid/KIND` (M, k), the volume cells
+        of a kind; `surface/NAME` (F, 4), the corners of the faces of a named surface, the last one
+        twice in triangles; and `region/NAME` (m,), the numbers of the volume cells of a named
+        region.
     """
     parts: dict[str, list[IntArray]] = {}
     first = 0
@@ -36,7 +38,9 @@ def mesh_arrays_of(points: FloatArray, blocks: Sequence[Block]) -> dict[str, NDA
             parts.setdefault(f"solid/{block.kind}", []).append(block.nodes)
         for name, cells in block.groups.items():
             if block.dimension == 2 and block.kind in _CORNERS and len(cells):
-                parts.setdefault(f"surface/{name}", []).append(block.nodes[cells, : _CORNERS[block.kind]])
+                parts.setdefault(f"surface/{name}", []).append(
+                    block.nodes[cells, : _CORNERS[block.kind]]
+                )
             if block.dimension == 3 and len(cells):
                 parts.setdefault(f"region/{name}", []).append(first + cells)
         first += len(block.nodes) if block.dimension == 3 else 0
@@ -44,13 +48,15 @@ def mesh_arrays_of(points: FloatArray, blocks: Sequence[Block]) -> dict[str, NDA
     arrays: dict[str, NDArray[Any]] = {"points": points, "types": types}
     for name, blocks_of in parts.items():
         if name.startswith("surface/"):  # of prisms, with triangles beside quadrilaterals
-            blocks_of = [np.pad(faces, ((0, 0), (0, 4 - faces.shape[1])), mode="edge") for faces in blocks_of]
+            blocks_of = [
+                np.pad(faces, ((0, 0), (0, 4 - faces.shape[1])), mode="edge") for faces in blocks_of
+            ]
         arrays[name] = np.concatenate(blocks_of)
     return arrays
 
 
 def rows_of(numbers: IntArray, nodes: IntArray) -> IntArray:
-    """Returns the rows of the points (N,) with the numbers of a file's nodes, in the shape of `nodes`.
+    """Returns the rows of the points (N,) with numbers of a file's nodes, in the shape of `nodes`.
 
     Raises:
         DecodingError: a cell has a node that the file lacks.
@@ -59,5 +65,7 @@ def rows_of(numbers: IntArray, nodes: IntArray) -> IntArray:
     at = np.minimum(np.searchsorted(numbers, nodes, sorter=order), len(numbers) - 1)
     rows = order[at] if len(numbers) else np.zeros_like(nodes)
     if (missing := nodes[numbers[rows] != nodes] if len(numbers) else nodes).size:
-        raise DecodingError(f"node {missing.flat[0]} of a cell is not in the file; save the mesh again")
+        raise DecodingError(
+            f"node {missing.flat[0]} of a cell is not in the file; save the mesh again"
+        )
     return rows

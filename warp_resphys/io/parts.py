@@ -1,4 +1,7 @@
-"""Work on trials in parts, in one process or several; interrupted work keeps its finished parts, each in a file."""
+"""Work on trials in parts, in one process or several.
+
+Interrupted work keeps its finished parts, each in a file.
+"""
 
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,12 +21,20 @@ from .errors import DataFileError, InputError
 from .fan_out import ALONE, Workers, fan_out
 from .progress import Progress
 from .resuming import StageContext
-from .safe_files import atomic_hdf5, create, is_final, read_array, read_hdf5, resume_checkpoint, write_checkpoint
+from .safe_files import (
+    atomic_hdf5,
+    create,
+    is_final,
+    read_array,
+    read_hdf5,
+    resume_checkpoint,
+    write_checkpoint,
+)
 
 Report = Callable[..., None]
 Arrays = Mapping[str, tuple[NDArray[Any], str]]  # with their units
-# Computes the arrays (R, ...) of a part; the argument is to be called after each frame, with named values that are
-# displayed beside the progress bar. It is pickled for other processes.
+# Computes the arrays (R, ...) of a part; the argument is to be called after each frame, with named
+# values that are displayed beside the progress bar. It is pickled for other processes.
 Work = Callable[[Report], Arrays]
 
 
@@ -34,7 +45,8 @@ class TrialPart:
     Attributes:
         label: name of the file.
         names: names of the R trials.
-        frames: number of frames per trial that the progress bar expects; there may be a few more or less.
+        frames: number of frames per trial that the progress bar expects; there may be a few more or
+            less.
         work: computes the arrays.
     """
 
@@ -84,13 +96,27 @@ class Parts:
         fingerprint: str = "",
         batch: int | None = None,
     ) -> None:
-        self.name, self.workers, self.folder, self.fingerprint, self.batch = name, workers, folder, fingerprint, batch
+        self.name, self.workers, self.folder, self.fingerprint, self.batch = (
+            name,
+            workers,
+            folder,
+            fingerprint,
+            batch,
+        )
         self._kept: dict[TrialPart, Arrays] = {}
 
     @classmethod
-    def of(cls, context: StageContext, workers: Workers = ALONE, batch: int | None = None) -> "Parts":
+    def of(
+        cls, context: StageContext, workers: Workers = ALONE, batch: int | None = None
+    ) -> "Parts":
         """Returns the parts of a stage, with their files in the folder of the run."""
-        return cls(context.name, workers, context.run_dir / f"{context.name}_parts", context.fingerprint, batch)
+        return cls(
+            context.name,
+            workers,
+            context.run_dir / f"{context.name}_parts",
+            context.fingerprint,
+            batch,
+        )
 
     def run(self, parts: Sequence[TrialPart]) -> None:
         """Computes the parts that are not done.
@@ -100,7 +126,9 @@ class Parts:
             DataFileError: a file could not be written.
         """
         left, workers = [part for part in parts if not self._is_done(part)], self.workers
-        total, missing = (sum(part.frames * len(part.names) for part in subset) for subset in (parts, left))
+        total, missing = (
+            sum(part.frames * len(part.names) for part in subset) for subset in (parts, left)
+        )
         with Progress(self.name, total, "frames", total - missing) as progress:
             if workers.alone or (workers.address is None and len(parts) == 1):
                 with threadpool_limits(1):  # As in worker processes, for the same results.
@@ -111,8 +139,15 @@ class Parts:
                 self.folder.mkdir(parents=True, exist_ok=True)
             frames = [part.frames * len(part.names) for part in left]
             shared, crew = self.folder or Path.cwd(), workers.at_most(len(left))
-            keeps = Parts(self.name, folder=self.folder, fingerprint=self.fingerprint)  # without arrays
-            results = fan_out(partial(_compute, keeps), left, crew, shared, lambda at: progress.advance(frames[at]))
+            # Without arrays.
+            keeps = Parts(self.name, folder=self.folder, fingerprint=self.fingerprint)
+            results = fan_out(
+                partial(_compute, keeps),
+                left,
+                crew,
+                shared,
+                lambda at: progress.advance(frames[at]),
+            )
             if self.folder is None:
                 self._kept |= dict(zip(left, results, strict=True))
 
@@ -183,13 +218,16 @@ class Checkpoint:
         self._path = None if path is None else Path(path)
         if self._path is not None:
             if self._path.is_dir():
-                raise DataFileError(f"{path} is a folder: give the path of a file for the finished searches.")
+                raise DataFileError(
+                    f"{path} is a folder: give the path of a file for the finished searches."
+                )
             try:
                 self._fingerprint = _Hasher("md5").hash(depends_on)
             except PicklingError as error:
                 raise InputError(
-                    f"{path} cannot keep searches with a class or function that is no part of a module "
-                    f"({error.args[0]}): define it at the top of a file, or leave kept out."
+                    f"{path} cannot keep searches with a class or function that is no part of a "
+                    f"module ({error.args[0]}): define it "
+                    "at the top of a file, or leave kept out."
                 ) from error
             checkpoint = resume_checkpoint(self._path, "parts", self._fingerprint)
             self.parts = {} if checkpoint is None else checkpoint[1]["parts"]
@@ -199,25 +237,39 @@ class Checkpoint:
         if key not in self.parts:
             self.parts[key] = work()
             if self._path is not None:
-                write_checkpoint(self._path, "parts", {}, {"fingerprint": self._fingerprint, "parts": self.parts})
+                write_checkpoint(
+                    self._path, "parts", {}, {"fingerprint": self._fingerprint, "parts": self.parts}
+                )
         return self.parts[key]
 
 
 class _Hasher(NumpyHasher):
-    """Hashes objects by their content: tensors as arrays, and without what `cached_property` has kept."""
+    """Hashes objects by their content: tensors as arrays,
+    and without what `cached_property` has kept.
+    """
 
     def save(self, obj: Any) -> None:
         super().save(obj.numpy(force=True) if isinstance(obj, torch.Tensor) else obj)
 
     def reducer_override(self, obj: Any) -> Any:
-        kept = [x for x in getattr(obj, "__dict__", ()) if isinstance(getattr(type(obj), x, None), cached_property)]
+        kept = [
+            x
+            for x in getattr(obj, "__dict__", ())
+            if isinstance(getattr(type(obj), x, None), cached_property)
+        ]
         if not kept:
             return NotImplemented
-        return object.__new__, (type(obj),), {name: x for name, x in obj.__getstate__().items() if name not in kept}
+        return (
+            object.__new__,
+            (type(obj),),
+            {name: x for name, x in obj.__getstate__().items() if name not in kept},
+        )
 
 
 def padded(arrays: Sequence[NDArray[Any]], frames: int = 0) -> NDArray[Any]:
-    """Joins arrays (R, T, ...) along R, with at least `frames` frames: NaN past the end of shorter arrays."""
+    """Joins arrays (R, T, ...) along R, with at least `frames` frames:
+    NaN past the end of shorter arrays.
+    """
     frames = max(frames, *(array.shape[1] for array in arrays))
 
     def extended(array: NDArray[Any]) -> NDArray[Any]:

@@ -1,4 +1,6 @@
-"""This process: imports without garbage collector, whose searches take a quarter of their time, and end by SIGTERM."""
+"""This process: imports without garbage collector, whose searches take a quarter
+of their time, and end by SIGTERM.
+"""
 
 import gc
 import signal
@@ -20,7 +22,9 @@ def collector_paused() -> Iterator[None]:
 
 @contextmanager
 def ends_as_after_ctrl_c() -> Iterator[None]:
-    """Lets SIGTERM, by which clusters and containers end a process, act as Ctrl-C, unless the program handles it."""
+    """Lets SIGTERM, by which clusters and containers end a process,
+    act as Ctrl-C, unless the program handles it.
+    """
     main = threading.current_thread() is threading.main_thread()
     if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
         yield

@@ -1,4 +1,7 @@
-"""Progress of a computation: a bar in a terminal, an occasional line in a log; tables and sentences in a terminal."""
+"""Progress of a computation: a bar in a terminal, an occasional line in a log.
+
+Tables and sentences in a terminal.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,8 @@ _LINE_SECONDS = 10.0
 _SURE_CALLS, _SURE_SECONDS = 8, 20.0  # of which one is done before an estimate is shown
 _AT_MOST = " at most"  # of units of work that may end early
 _SHOWN: Final = ContextVar("shown", default=True)
-_RUNNING: Final = ContextVar("running", default=0)  # number of loops that are shown; a terminal has room for one bar
+# Number of loops that are shown; a terminal has room for one bar.
+_RUNNING: Final = ContextVar("running", default=0)
 # Work of the loops of a stage, which ends with one line for all of them; None outside of stages.
 _STAGE: Final = ContextVar[list[str] | None]("stage", default=None)
 _TITLES: Final = {  # of stages, by the first word of their names, and of single ones
@@ -52,14 +56,19 @@ _LOG_WIDTH: Final = 110  # of tables that go to a file, in characters
 
 
 def title_of(stage: str) -> str:
-    """Returns what a stage, or a part of one after a colon, does, in words; a name that is no stage unchanged."""
+    """Returns what a stage, or a part of one after a colon, does, in words.
+
+    A name that is no stage unchanged.
+    """
     name, colon, part = stage.partition(":")
     return f"{_TITLES.get(name) or _TITLES.get(name.partition('_')[0], name)}{colon}{part}"
 
 
 @contextmanager
 def one_line(stage: str) -> Iterator[Callable[[float], str]]:
-    """Shows the loops of a stage without lines at their ends; the yielded function makes that of the stage.
+    """Shows the loops of a stage without lines at their ends.
+
+    The yielded function makes that of the stage.
 
     Args:
         stage: its name.
@@ -67,21 +76,28 @@ def one_line(stage: str) -> Iterator[Callable[[float], str]]:
     done: list[str] = []
     token = _STAGE.set(done)
     try:
-        yield lambda seconds: f"{title_of(stage):<42}{(done or [''])[0]:<16}{duration(seconds)}".rstrip()
+        yield (
+            lambda seconds: (
+                f"{title_of(stage):<42}{(done or [''])[0]:<16}{duration(seconds)}".rstrip()
+            )
+        )
     finally:
         _STAGE.reset(token)
 
 
 def be_quiet() -> None:
-    """Disables progress output in this process, such as a worker whose parent shows the progress of all."""
+    """Disables progress output in this process, such
+    as a worker whose parent shows the progress of all.
+    """
     _SHOWN.set(False)
 
 
 class Progress:
     """Shows count, rate, remaining time and the latest values of a loop.
 
-    Use it as a context manager and call `advance` in the loop; most calls only count, in about a microsecond. Without
-    a terminal (log files, continuous integration), it prints a line at most every ten seconds, and one at the end.
+    Use it as a context manager and call `advance` in the loop; most calls only count, in about a
+    microsecond. Without a terminal (log files, continuous integration), it prints a line at most
+    every ten seconds, and one at the end.
 
     Args:
         description: Name of the computation, or of the stage.
@@ -89,8 +105,8 @@ class Progress:
         unit: Name of the units, in the plural.
         start_at: Number of units done by an interrupted run; they do not count for the rate.
         console: Output; stderr by default.
-        after: Seconds before which nothing is shown, for work that is mostly short; such a progress shows nothing
-            within that of longer work.
+        after: Seconds before which nothing is shown, for work that is mostly short; such a progress
+            shows nothing within that of longer work.
     """
 
     def __init__(
@@ -109,7 +125,8 @@ class Progress:
         self.console = Console(stderr=True, quiet=not _SHOWN.get()) if console is None else console
         self._fields: dict[str, object] = {}
         self._start = self._next = 0.0
-        self._marks = ((0.0, 0), (0.0, 0))  # times at which the units done had doubled, and these units
+        # Times at which the units done had doubled, and these units.
+        self._marks = ((0.0, 0), (0.0, 0))
         self._bars: Bars | None = None
         self._task = TaskID(0)
 
@@ -117,7 +134,9 @@ class Progress:
         """Starts the clock, and shows the bar in a terminal."""
         self._start = time.perf_counter()
         self._marks = ((self._start, 0), (self._start, 0))
-        self._next = self._start + (self._after if self.console.is_terminal else max(self._after, _LINE_SECONDS))
+        self._next = self._start + (
+            self._after if self.console.is_terminal else max(self._after, _LINE_SECONDS)
+        )
         if self._after and _RUNNING.get():
             self._next = math.inf
         self._token = _RUNNING.set(_RUNNING.get() + 1)
@@ -126,21 +145,37 @@ class Progress:
         return self
 
     def _start_bar(self) -> None:
-        columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[status]}")
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[status]}"),
+        )
         options: dict[str, Any] = {"refresh_per_second": 5, "redirect_stdout": sys.stdout.isatty()}
-        self._bars = Bars(*columns, console=self.console, transient=_STAGE.get() is not None, **options)
+        self._bars = Bars(
+            *columns, console=self.console, transient=_STAGE.get() is not None, **options
+        )
         self._bars.start()
-        self._task = self._bars.add_task(self._title, total=self.total, completed=self.done, status=self.status())
+        self._task = self._bars.add_task(
+            self._title, total=self.total, completed=self.done, status=self.status()
+        )
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         """Shows the final state."""
         now, self._ended = time.perf_counter(), kind is None and self.unit.endswith(_AT_MOST)
         _RUNNING.reset(self._token)
         stage = _STAGE.get()
         waited = not self._after or (self._next < math.inf and now >= self._start + self._after)
-        if stage is not None and not self._after and not _RUNNING.get() and not self.unit.endswith(_AT_MOST):
+        if (
+            stage is not None
+            and not self._after
+            and not _RUNNING.get()
+            and not self.unit.endswith(_AT_MOST)
+        ):
             stage.append(f"{self.total:,} {self.unit}")
         if self._bars is not None or (waited and self.done != self._shown and stage is None):
             self._show(now)
@@ -168,8 +203,9 @@ class Progress:
     def status(self) -> str:
         """Count, remaining time and latest values in one line.
 
-        The time left follows from the later units, as the first ones wait for kernels to be compiled or processes to
-        start; it is not shown before some of them are done, nor for work that may end early.
+        The time left follows from the later units, as the first ones wait for kernels to be
+        compiled or processes to start; it is not shown before some of them are done, nor for work
+        that may end early.
         """
         now, new = time.perf_counter(), self.done - self._start_at
         since, before = self._marks[0]
@@ -179,7 +215,11 @@ class Progress:
         parts = parts or [f"{self.done}/{self.total} {unit}"]
         if self._ended or self.done >= self.total:
             parts.append(f"in {duration(now - self._start)}")
-        elif new > before > 0 and (self._calls >= _SURE_CALLS or now > since + _SURE_SECONDS) and not at_most:
+        elif (
+            new > before > 0
+            and (self._calls >= _SURE_CALLS or now > since + _SURE_SECONDS)
+            and not at_most
+        ):
             parts.append(f"{clock((self.total - self.done) * (now - since) / (new - before))} left")
         for name, value in self._fields.items():
             parts.append(f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}")
@@ -193,7 +233,9 @@ class Progress:
             self._bars.update(self._task, completed=self.done, status=self.status())
             self._next = now + _BAR_SECONDS
         else:
-            self.console.print(f"{self._title}: {self.status()}", markup=False, highlight=False, soft_wrap=True)
+            self.console.print(
+                f"{self._title}: {self.status()}", markup=False, highlight=False, soft_wrap=True
+            )
             self._next = now + _LINE_SECONDS
 
 
@@ -217,7 +259,9 @@ def show(*parts: RenderableType) -> None:
 
 
 def aligned(rows: Sequence[Sequence[str]], left: int = 1) -> str:
-    """Rows as lines of text, the first `left` columns aligned to the left, the others to the right."""
+    """Rows as lines of text, the first `left` columns aligned to the left,
+    the others to the right.
+    """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(

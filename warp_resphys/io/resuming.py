@@ -1,7 +1,9 @@
-"""Runs the stages of an experiment; a stage runs again only if its settings, inputs or outputs have changed.
+"""Runs the stages of an experiment.
 
-A stage reads and writes files in the run folder. Its record (`stages/<name>.json`) has a fingerprint of its settings
-and of those of all stages upstream.
+A stage runs again only if its settings, inputs or outputs have changed.
+
+A stage reads and writes files in the run folder. Its record (`stages/<name>.json`) has a
+fingerprint of its settings and of those of all stages upstream.
 """
 
 from __future__ import annotations
@@ -34,7 +36,16 @@ log = logging.getLogger(__name__)
 
 _VALID, _CHANGED = "up to date", "settings changed"  # states of an earlier run
 _PLANNED = "stages.json"  # fingerprints and settings of all stages of the last command
-_PACKAGES = ("warp-resphys", "warp-lang", "torch", "numpy", "scipy", "cholespy", "h5py", "hydra-core")
+_PACKAGES = (
+    "warp-resphys",
+    "warp-lang",
+    "torch",
+    "numpy",
+    "scipy",
+    "cholespy",
+    "h5py",
+    "hydra-core",
+)
 
 
 @dataclass(frozen=True)
@@ -45,7 +56,7 @@ class StageContext:
     run_dir: Path  # the run folder, where outputs are written
     fingerprint: str  # identifies everything that the outputs depend on; resumable files contain it
     settings: Any  # of the stage
-    upstream: Mapping[str, str] = field(default_factory=dict)  # fingerprints of the stages whose outputs it reads
+    upstream: Mapping[str, str] = field(default_factory=dict)  # of stages whose outputs it reads
 
 
 @dataclass(frozen=True)
@@ -55,7 +66,7 @@ class Stage:
     name: str  # also of its record
     function: Callable[[StageContext], None]  # does the work; writes outputs atomically
     outputs: tuple[str, ...]  # paths of the files that it writes, relative to the run folder
-    settings: Any  # everything that the outputs depend on, and no more: a `Settings` object or nested plain data
+    settings: Any  # all that the outputs depend on, and no more: `Settings` or nested plain data
     upstream: tuple[str, ...] = ()  # names of the stages whose outputs it reads
 
 
@@ -68,7 +79,9 @@ def fingerprint(stage: Stage, upstream_fingerprints: Mapping[str, str]) -> str:
     content = {
         "name": stage.name,
         "format_version": FORMAT_VERSION,
-        "settings": to_plain(stage.settings.content() if isinstance(stage.settings, Settings) else stage.settings),
+        "settings": to_plain(
+            stage.settings.content() if isinstance(stage.settings, Settings) else stage.settings
+        ),
         "upstream": [upstream_fingerprints[name] for name in stage.upstream],
     }
     if packages := packages_of(stage.settings):
@@ -77,7 +90,9 @@ def fingerprint(stage: Stage, upstream_fingerprints: Mapping[str, str]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def run_stages(stages: Sequence[Stage], run_dir: str | Path, wait: bool = False) -> dict[str, float]:
+def run_stages(
+    stages: Sequence[Stage], run_dir: str | Path, wait: bool = False
+) -> dict[str, float]:
     """Runs the stages whose outputs are missing, damaged or of other settings.
 
     Args:
@@ -105,8 +120,8 @@ def run_stages(stages: Sequence[Stage], run_dir: str | Path, wait: bool = False)
             except KeyboardInterrupt as error:
                 kept = f"finished and kept: {', '.join(seconds)}; " if seconds else ""
                 raise StageInterrupted(
-                    f"interrupted in stage '{stage.name}' ({kept}what '{stage.name}' has saved is kept, too); the same "
-                    "command resumes there"
+                    f"interrupted in stage '{stage.name}' ({kept}what '{stage.name}' has saved "
+                    "is kept, too); the same command resumes there"
                 ) from error
     return seconds
 
@@ -126,14 +141,18 @@ def _plan(stages: Sequence[tuple[Stage, StageContext]], path: Path) -> None:
 
 def unfinished(stages: Sequence[Stage], run_dir: str | Path) -> list[Stage]:
     """Returns the stages that `run_stages` would run."""
-    return [stage for stage, context in _contexts(stages, Path(run_dir)) if _earlier(stage, context)[0] is None]
+    return [
+        stage
+        for stage, context in _contexts(stages, Path(run_dir))
+        if _earlier(stage, context)[0] is None
+    ]
 
 
 def expected_seconds(stages: Sequence[Stage], run_dir: str | Path) -> dict[str, float]:
     """Returns how long stages took that did the same before, by name [s].
 
-    These are stages of one name on the same body, the same data and the same budget, in this folder and in those beside
-    it, of which the last one counts.
+    These are stages of one name on the same body, the same data and the same budget, in this folder
+    and in those beside it, of which the last one counts.
     """
     took = dict[str, float]()
     for stage in stages:
@@ -158,10 +177,17 @@ def _contexts(stages: Sequence[Stage], run_dir: Path) -> Iterator[tuple[Stage, S
     fingerprints: dict[str, str] = {}
     for stage in stages:
         if stage.name in fingerprints or not fingerprints.keys() >= set(stage.upstream):
-            raise ValueError(f"stage '{stage.name}' occurs twice, or comes before a stage whose outputs it reads")
+            raise ValueError(
+                f"stage '{stage.name}' occurs twice, or comes before a stage whose outputs it reads"
+            )
         fingerprints[stage.name] = fingerprint(stage, fingerprints)
         upstream = {name: fingerprints[name] for name in stage.upstream}
-        yield stage, StageContext(stage.name, run_dir, fingerprints[stage.name], stage.settings, upstream=upstream)
+        yield (
+            stage,
+            StageContext(
+                stage.name, run_dir, fingerprints[stage.name], stage.settings, upstream=upstream
+            ),
+        )
 
 
 def _record(run_dir: Path, name: str) -> Path:
@@ -169,7 +195,10 @@ def _record(run_dir: Path, name: str) -> Path:
 
 
 def _run_stage(stage: Stage, context: StageContext) -> float:
-    """Runs one stage and writes its record; returns its duration, including interrupted runs [s]."""
+    """Runs one stage and writes its record.
+
+    Returns its duration, including interrupted runs [s].
+    """
     interrupted = _record(context.run_dir, stage.name).with_suffix(".interrupted.json")
     before = read_json(interrupted) if interrupted.is_file() else {}
     seconds = float(before["seconds"]) if before.get("fingerprint") == context.fingerprint else 0.0
@@ -182,7 +211,10 @@ def _run_stage(stage: Stage, context: StageContext) -> float:
             log.info("%s", line(seconds))
     except (Exception, KeyboardInterrupt):
         with suppress(DataFileError):  # A full disk must not hide the error itself.
-            write_json(interrupted, {"fingerprint": context.fingerprint, "seconds": time.perf_counter() - start})
+            write_json(
+                interrupted,
+                {"fingerprint": context.fingerprint, "seconds": time.perf_counter() - start},
+            )
         raise
     interrupted.unlink(missing_ok=True)
     return seconds
@@ -209,42 +241,57 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
 
 
 def planned(run_dir: str | Path, name: str) -> dict[str, Any]:
-    """Returns ``fingerprint`` and ``settings`` of a stage in the last command that had it; empty if there was none."""
+    """Returns ``fingerprint`` and ``settings`` of a stage in the last command that had it.
+
+    Empty if there was none.
+    """
     path = Path(run_dir) / _PLANNED
     stages: dict[str, Any] = read_json(path) if path.is_file() else {}
     return stages.get(name, {})
 
 
 def finished_record(run_dir: str | Path, name: str) -> dict[str, Any]:
-    """Returns the record of a finished stage, with its ``settings``, after checking all files that it depends on.
+    """Returns the record of a finished stage, with its ``settings``,
+    after checking all files that it depends on.
 
     Raises:
-        DataFileError: there is no such folder, the stage is unfinished, was run by another version of this program, or
-            with a package that is not installed, or an output of it or of a stage upstream is missing or has changed.
+        DataFileError: there is no such folder, the stage is unfinished, was run by another version
+            of this program, or with a package that is not installed, or an output of it or of a
+            stage upstream is missing or has changed.
     """
     folder = Path(run_dir)
     if not (folder / "stages").is_dir():
-        raise DataFileError(f"{folder} is not a run folder: name one that `warp-resphys` has written.")
+        raise DataFileError(
+            f"{folder} is not a run folder: name one that `warp-resphys` has written."
+        )
     again = "run its command again"
     path = _record(folder, name)
     if not path.is_file():
-        raise DataFileError(f"{folder} is unfinished: its stage '{name}' was not completed; {again}.")
+        raise DataFileError(
+            f"{folder} is unfinished: its stage '{name}' was not completed; {again}."
+        )
     record: dict[str, Any] = read_json(path)
     made, here = (
-        versions.get("warp-resphys", "an unknown version") for versions in (record["versions"], package_versions())
+        versions.get("warp-resphys", "an unknown version")
+        for versions in (record["versions"], package_versions())
     )
     if made.split(".")[:2] != here.split(".")[:2]:
         raise DataFileError(
-            f"{folder} was written by warp-resphys {made}, and this is {here}: {again} in another run folder, or use "
-            "the version that wrote it."
+            f"{folder} was written by warp-resphys {made}, and this is {here}: {again} in "
+            "another run folder, or use the version that wrote it."
         )
     check_packages(record.get("packages", {}), folder)
     for output, identity in record["outputs"].items():
         if not _is_same(folder / output, identity):
-            raise DataFileError(f"{folder / output} is missing or has changed since it was written: {again}.")
+            raise DataFileError(
+                f"{folder / output} is missing or has changed since it was written: {again}."
+            )
     for earlier, expected in record.get("upstream", {}).items():
         if finished_record(folder, earlier)["fingerprint"] != expected:
-            raise DataFileError(f"{folder} is unfinished: its stage '{earlier}' was run again after '{name}'; {again}.")
+            raise DataFileError(
+                f"{folder} is unfinished: its stage '{earlier}' was run again after '{name}'; "
+                f"{again}."
+            )
     return record
 
 
@@ -256,12 +303,16 @@ class Resources(TypedDict):
 
 
 def resources_used(run_dir: str | Path, names: Sequence[str]) -> Resources:
-    """Returns durations [s] and the largest peak of memory [GiB] of finished stages, for `metrics.json`."""
+    """Returns durations [s] and the largest peak of memory [GiB]
+    of finished stages, for `metrics.json`.
+    """
     paths = {name: _record(Path(run_dir), name) for name in names}
     records = {name: read_json(path) for name, path in paths.items() if path.is_file()}
     return {
         "seconds": {name: record["seconds"] for name, record in records.items()},
-        "peak_memory_gib": max((record["peak_memory_gib"] for record in records.values()), default=None),
+        "peak_memory_gib": max(
+            (record["peak_memory_gib"] for record in records.values()), default=None
+        ),
     }
 
 
@@ -272,7 +323,10 @@ def _identity(path: Path) -> dict[str, Any]:
 
 
 def _earlier(stage: Stage, context: StageContext) -> tuple[float | None, str]:
-    """The duration of an earlier run whose outputs are still valid, or None; and its state in words."""
+    """The duration of an earlier run whose outputs are still valid, or None.
+
+    And its state in words.
+    """
     path = _record(context.run_dir, stage.name)
     if not path.is_file():
         return None, ""
@@ -280,7 +334,11 @@ def _earlier(stage: Stage, context: StageContext) -> tuple[float | None, str]:
         record = read_json(path)
         if record["fingerprint"] != context.fingerprint:
             return None, _CHANGED
-        changed = [name for name in stage.outputs if not _is_same(context.run_dir / name, record["outputs"][name])]
+        changed = [
+            name
+            for name in stage.outputs
+            if not _is_same(context.run_dir / name, record["outputs"][name])
+        ]
         if changed:
             return None, f"missing or changed since they were written: {', '.join(changed)}"
         return float(record["seconds"]), _VALID
@@ -289,10 +347,15 @@ def _earlier(stage: Stage, context: StageContext) -> tuple[float | None, str]:
 
 
 def _is_same(path: Path, identity: Mapping[str, Any]) -> bool:
-    """Compares a file with its identity; its content is read only if the times differ, as they do after copying."""
+    """Compares a file with its identity.
+
+    Its content is read only if the times differ, as they do after copying.
+    """
     if not path.is_file() or path.stat().st_size != identity["bytes"]:
         return False
-    return bool(path.stat().st_mtime_ns == identity["modified_ns"] or digest(path) == identity["sha256"])
+    return bool(
+        path.stat().st_mtime_ns == identity["modified_ns"] or digest(path) == identity["sha256"]
+    )
 
 
 @contextmanager
@@ -313,7 +376,8 @@ def run_lock(run_dir: str | Path, wait: bool = False) -> Iterator[None]:
         path.open("a").close()
     except OSError as error:
         raise DataFileError(
-            f"cannot write the run folder {run_dir} ({error.strerror}): make it writable or choose another one"
+            f"cannot write the run folder {run_dir} ({error.strerror}): make it writable or "
+            "choose another one"
         ) from error
     lock = FileLock(path)
     try:
@@ -321,13 +385,16 @@ def run_lock(run_dir: str | Path, wait: bool = False) -> Iterator[None]:
     except Timeout as error:
         if not wait:
             raise InputError(
-                f"another process is writing the run folder {run_dir}: wait for it or choose another one"
+                f"another process is writing the run folder {run_dir}: "
+                "wait for it or choose another one"
             ) from error
         log.info("waiting for another process that is writing the run folder %s", run_dir)
         lock.acquire()
     except (OSError, NotImplementedError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise DataFileError(f"cannot lock the run folder {run_dir} ({reason}): choose one on another disk") from error
+        raise DataFileError(
+            f"cannot lock the run folder {run_dir} ({reason}): choose one on another disk"
+        ) from error
     try:
         yield
     finally:
@@ -336,7 +403,10 @@ def run_lock(run_dir: str | Path, wait: bool = False) -> Iterator[None]:
 
 @cache
 def package_versions() -> Mapping[str, str]:
-    """Versions of Python and of the packages that results depend on; absent packages are left out."""
+    """Versions of Python and of the packages that results depend on.
+
+    Absent packages are left out.
+    """
     versions = {"python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):

@@ -1,8 +1,9 @@
-"""Reads and writes JSON, HDF5, NumPy and safetensors files, none of which can run code when it is opened.
+"""Reads and writes JSON, HDF5, NumPy and safetensors files,
+none of which can run code when it is opened.
 
-All are written atomically. HDF5 files are built in memory first, because the HDF5 library cannot close a file on a full
-disk and crashes the interpreter at exit; a file should fit into memory two or three times. Interrupted work resumes
-from checkpoints.
+All are written atomically. HDF5 files are built in memory first, because the HDF5 library cannot
+close a file on a full disk and crashes the interpreter at exit; a file should fit into memory two
+or three times. Interrupted work resumes from checkpoints.
 """
 
 from __future__ import annotations
@@ -37,13 +38,23 @@ CHUNK_STEPS = 64
 LARGEST_ARRAYS = 4 << 30  # bytes in one file
 # Errors of numpy.load for a file that is damaged or malicious.
 _ARRAY_FAULTS = (
-    *(EOFError, LookupError, MemoryError, OverflowError, RuntimeError, SyntaxError, TypeError, ValueError),
+    EOFError,
+    LookupError,
+    MemoryError,
+    OverflowError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
     *(struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
 
 
 def to_plain(data: Any) -> Any:
-    """Converts mappings, sequences, NumPy values, paths and settings to JSON types; others raise TypeError."""
+    """Converts mappings, sequences, NumPy values, paths and settings to JSON types.
+
+    Others raise TypeError.
+    """
     if isinstance(data, Mapping):
         return {str(key): to_plain(value) for key, value in data.items()}
     if isinstance(data, (list, tuple)):
@@ -82,7 +93,9 @@ def read_json(path: str | Path) -> Any:
 
 
 @contextlib.contextmanager
-def atomic_hdf5(path: str | Path, kind: str, attributes: Mapping[str, Any] | None = None) -> Iterator[h5py.File]:
+def atomic_hdf5(
+    path: str | Path, kind: str, attributes: Mapping[str, Any] | None = None
+) -> Iterator[h5py.File]:
     """Yields an HDF5 file in memory, which is written to `path` atomically when the block ends.
 
     Args:
@@ -91,8 +104,13 @@ def atomic_hdf5(path: str | Path, kind: str, attributes: Mapping[str, Any] | Non
         attributes: Further attributes of the file's root (numbers, strings, small arrays).
     """
     in_memory = {"driver": "core", "backing_store": False, "block_size": 1 << 20}
-    with atomic_path(path) as partial, h5py.File(partial.name, "w", libver=("v110", "v110"), **in_memory) as file:
-        file.attrs.update({**(attributes or {}), "format": FORMAT, "version": FORMAT_VERSION, "kind": kind})
+    with (
+        atomic_path(path) as partial,
+        h5py.File(partial.name, "w", libver=("v110", "v110"), **in_memory) as file,
+    ):
+        file.attrs.update(
+            {**(attributes or {}), "format": FORMAT, "version": FORMAT_VERSION, "kind": kind}
+        )
         file.attrs["complete"] = False
         yield file
         file.attrs["complete"] = True
@@ -100,7 +118,9 @@ def atomic_hdf5(path: str | Path, kind: str, attributes: Mapping[str, Any] | Non
         partial.write_bytes(file.id.get_file_image())
 
 
-def create(group: h5py.Group, name: str, array: npt.ArrayLike, units: str = "1", time_axis: int = 0) -> h5py.Dataset:
+def create(
+    group: h5py.Group, name: str, array: npt.ArrayLike, units: str = "1", time_axis: int = 0
+) -> h5py.Dataset:
     """Stores an array as a dataset, in chunks of 64 steps along `time_axis`, each with a checksum.
 
     Args:
@@ -130,11 +150,15 @@ def hdf5_error(path: Path, error: Exception) -> DataFileError:
     if "truncated" in message:
         return DataFileError(f"{path} is truncated: delete it, then write or download it again")
     if "unable to lock" in message:
-        return DataFileError(f"{path} is being written by another process: wait until that has ended")
+        return DataFileError(
+            f"{path} is being written by another process: wait until that has ended"
+        )
     if isinstance(error, OSError) and error.filename is not None:
         return read_error(path, error)
     detail = message.splitlines()[0] if message else type(error).__name__
-    return DataFileError(f"{path} is damaged ({detail}): delete it, then write or download it again")
+    return DataFileError(
+        f"{path} is damaged ({detail}): delete it, then write or download it again"
+    )
 
 
 @contextlib.contextmanager
@@ -142,13 +166,15 @@ def read_hdf5(path: str | Path, expected_kind: str) -> Iterator[h5py.File]:
     """Opens a file of `atomic_hdf5`.
 
     Raises:
-        DataFileError: the file is missing, unreadable or damaged, refers to other files (external links, external
-            storage, virtual datasets), is of another program, kind or version, or unfinished.
+        DataFileError: the file is missing, unreadable or damaged, refers to other files (external
+            links, external storage, virtual datasets), is of another program, kind or version, or
+            unfinished.
     """
     path = Path(path)
     with contextlib.ExitStack() as stack:
         try:
-            path.open("rb").close()  # The library's error for a file that cannot be opened has no cause.
+            # The library's error for a file that cannot be opened has no cause.
+            path.open("rb").close()
             file = stack.enter_context(h5py.File(path, "r"))
             refuse_data_elsewhere(file)
         except (DecodingError, OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
@@ -161,13 +187,17 @@ def read_hdf5(path: str | Path, expected_kind: str) -> Iterator[h5py.File]:
                 raise DataFileError(f"{path} was not written by {FORMAT}: check the path")
             if version != str(FORMAT_VERSION):
                 raise DataFileError(
-                    f"{path} has format version {version}, this program reads version {FORMAT_VERSION}: write it again "
-                    "or use the program that wrote it"
+                    f"{path} has format version {version}, this program reads version "
+                    f"{FORMAT_VERSION}: write it again or use the program that wrote it"
                 )
             if kind != expected_kind:
-                raise DataFileError(f"{path} contains '{kind}' where '{expected_kind}' is needed: check the path")
+                raise DataFileError(
+                    f"{path} contains '{kind}' where '{expected_kind}' is needed: check the path"
+                )
             if complete != "True":
-                raise DataFileError(f"{path} is unfinished: delete it and run the stage that writes it again")
+                raise DataFileError(
+                    f"{path} is unfinished: delete it and run the stage that writes it again"
+                )
             yield file
         except OSError as error:
             if error.filename is not None:
@@ -175,15 +205,20 @@ def read_hdf5(path: str | Path, expected_kind: str) -> Iterator[h5py.File]:
             raise hdf5_error(path, error) from error
 
 
-def read_arrays(path: str | Path, names: Sequence[str] | None = None) -> dict[str, npt.NDArray[Any]]:
-    """Reads the arrays of a .npz file by name, or the array of a .npy file under the name ""; no pickled objects.
+def read_arrays(
+    path: str | Path, names: Sequence[str] | None = None
+) -> dict[str, npt.NDArray[Any]]:
+    """Reads the arrays of a .npz file by name, or the array of a .npy file under the name "".
+
+    No pickled objects.
 
     Args:
         path: the file.
         names: the arrays to read; all by default.
 
     Raises:
-        DataFileError: the file is missing, damaged or not of NumPy, contains Python objects, or is too large.
+        DataFileError: the file is missing, damaged or not of NumPy, contains Python objects, or is
+            too large.
     """
     try:
         with open(path, "rb") as file:
@@ -196,9 +231,14 @@ def read_arrays(path: str | Path, names: Sequence[str] | None = None) -> dict[st
     except OSError as error:
         raise read_error(path, error) from error
     except _ARRAY_FAULTS as error:
-        reason = "it contains Python objects, which can run code" if "allow_pickle" in str(error) else str(error)
+        reason = (
+            "it contains Python objects, which can run code"
+            if "allow_pickle" in str(error)
+            else str(error)
+        )
         raise DataFileError(
-            f"{path} is not a NumPy file of plain arrays, or is damaged ({reason}): save or download it again"
+            f"{path} is not a NumPy file of plain arrays, or is damaged ({reason}): save or "
+            "download it again"
         ) from error
 
 
@@ -223,10 +263,14 @@ def read_array(
             raise DataFileError(f"{path} has no dataset '{name}': check the path")
         stored = dataset.shape
         if shape is not None and (
-            len(stored) != len(shape) or any(b not in (a, None) for a, b in zip(stored, shape, strict=True))
+            len(stored) != len(shape)
+            or any(b not in (a, None) for a, b in zip(stored, shape, strict=True))
         ):
             wanted = " x ".join("any" if length is None else str(length) for length in shape)
-            raise DataFileError(f"'{name}' of {path} has the shape {stored} where {wanted} is needed: check the path")
+            raise DataFileError(
+                f"'{name}' of {path} has the shape {stored} "
+                f"where {wanted} is needed: check the path"
+            )
         return np.asarray(dataset[index])
     except OSError as error:
         raise hdf5_error(Path(path), error) from error
@@ -235,7 +279,9 @@ def read_array(
 def read_attribute(file: h5py.File, name: str) -> Any:
     """Reads an attribute of a file, or raises DataFileError where it is missing."""
     if name not in file.attrs:
-        raise DataFileError(f"{file.filename} has no attribute '{name}': write the file again, or check the path")
+        raise DataFileError(
+            f"{file.filename} has no attribute '{name}': write the file again, or check the path"
+        )
     return file.attrs[name]
 
 
@@ -256,11 +302,14 @@ def write_checkpoint(
         partial.write_bytes(save(copies, metadata=header))
 
 
-def read_checkpoint(path: str | Path, expected_kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+def read_checkpoint(
+    path: str | Path, expected_kind: str
+) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """Reads the tensors, on the CPU, and the metadata of a file of `write_checkpoint`.
 
     Raises:
-        DataFileError: the file is missing, unreadable, damaged, or of another program, kind or version.
+        DataFileError: the file is missing, unreadable, damaged, or of another program, kind or
+            version.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -272,8 +321,8 @@ def read_checkpoint(path: str | Path, expected_kind: str) -> tuple[dict[str, tor
             kind, version = header.get("kind"), header.get("version")
             if (kind, version) != (expected_kind, str(FORMAT_VERSION)):
                 raise DataFileError(
-                    f"{path} contains '{kind}', version {version}, where '{expected_kind}', version "
-                    f"{FORMAT_VERSION}, is needed: check the path"
+                    f"{path} contains '{kind}', version {version}, where '{expected_kind}', "
+                    f"version {FORMAT_VERSION}, is needed: check the path"
                 )
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
             return tensors, json.loads(header["metadata"])
@@ -281,7 +330,8 @@ def read_checkpoint(path: str | Path, expected_kind: str) -> tuple[dict[str, tor
         raise read_error(path, error) from error
     except (SafetensorError, ValueError, KeyError) as error:
         raise DataFileError(
-            f"{path} is not a complete safetensors file ({error}): delete it and run the same command again"
+            f"{path} is not a complete safetensors file ({error}): "
+            "delete it and run the same command again"
         ) from error
 
 
@@ -297,7 +347,9 @@ def is_final(path: Path, kind: str, fingerprint: str) -> bool:
         return str(file.attrs.get("fingerprint")) == fingerprint
 
 
-def resume_checkpoint(path: Path, kind: str, fingerprint: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]] | None:
+def resume_checkpoint(
+    path: Path, kind: str, fingerprint: str
+) -> tuple[dict[str, torch.Tensor], dict[str, Any]] | None:
     """Reads a checkpoint of work with this fingerprint; None if there is none that can be used."""
     if not path.exists():
         return None

@@ -1,4 +1,5 @@
-"""Error messages for refused settings: one sentence with the dotted key, the value, and what it must be.
+"""Error messages for refused settings: one sentence with the dotted key,
+the value, and what it must be.
 
 Types, ranges and units come from the JSON Schema of the settings class.
 """
@@ -33,23 +34,36 @@ class _Place:
 
     @property
     def kinds(self) -> list[Schema]:
-        """JSON Schemas of the types that the value may have, first that of the kind it names, such as ``kind: rod``."""
+        """JSON Schemas of the types that the value may have,
+        first that of the kind it names, such as ``kind: rod``.
+        """
 
         def names(option: Schema) -> bool:
-            fixed = {key: one["const"] for key, one in option.get("properties", {}).items() if "const" in one}
-            return isinstance(self.value, Mapping) and all(self.value.get(key) == word for key, word in fixed.items())
+            fixed = {
+                key: one["const"]
+                for key, one in option.get("properties", {}).items()
+                if "const" in one
+            }
+            return isinstance(self.value, Mapping) and all(
+                self.value.get(key) == word for key, word in fixed.items()
+            )
 
         return sorted(options(self.schema, self.node), key=lambda option: not names(option))
 
     def within(self, part: str | int) -> "_Place":
         """Returns the place of a key or of an entry of a list."""
-        value = self.value.get(_key(self.value, part)) if isinstance(self.value, Mapping) else self.value[part]
+        value = (
+            self.value.get(_key(self.value, part))
+            if isinstance(self.value, Mapping)
+            else self.value[part]
+        )
         node = next(filter(None, (_below(option, part) for option in self.kinds)), self.node)
         return _Place(self.schema, node, value, (*self.path, part), self)
 
 
 def sentence(schema: Schema, values: Any, where: str, errors: Sequence[ErrorDetails]) -> str:
-    """Returns the message of the most informative error: an unknown key, else the most deeply nested one.
+    """Returns the message of the most informative error:
+    an unknown key, else the most deeply nested one.
 
     Args:
         schema: JSON Schema of the class.
@@ -74,8 +88,15 @@ def sentence(schema: Schema, values: Any, where: str, errors: Sequence[ErrorDeta
         return f"{key} is missing: it must be {_in_words(place.node, schema)}."
     if kind.startswith("union_tag") and isinstance(value, Mapping):
         tag = str(error["ctx"]["discriminator"]).strip("'")
-        words = [str(word) for option in options(schema, place.node) for word in _words_of(option["properties"][tag])]
-        return f"{_dotted([tag], key)} is {_shown(value.get(tag))}: it must be one of {', '.join(words)}."
+        words = [
+            str(word)
+            for option in options(schema, place.node)
+            for word in _words_of(option["properties"][tag])
+        ]
+        return (
+            f"{_dotted([tag], key)} is {_shown(value.get(tag))}: it must be one of "
+            f"{', '.join(words)}."
+        )
     if kind.startswith("union_tag"):
         return f"{key} is {_shown(value)}: it must be a group of settings."
     if kind == "value_error" and isinstance(value, Mapping):
@@ -83,8 +104,13 @@ def sentence(schema: Schema, values: Any, where: str, errors: Sequence[ErrorDeta
     if kind == "value_error":
         return f"{key} is {_shown(value)}: {error['ctx']['error']}"
     texts = value if isinstance(value, (list, tuple)) else [value]
-    is_number = kind == "string_type" and any(isinstance(text, (bool, int, float)) for text in texts)
-    return f"{key} is {_shown(value)}: it must be {_in_words(place.node, schema)}{', in quotes' if is_number else ''}."
+    is_number = kind == "string_type" and any(
+        isinstance(text, (bool, int, float)) for text in texts
+    )
+    return (
+        f"{key} is {_shown(value)}: it must be "
+        f"{_in_words(place.node, schema)}{', in quotes' if is_number else ''}."
+    )
 
 
 def _place(whole: _Place, error: ErrorDetails) -> _Place:
@@ -93,15 +119,23 @@ def _place(whole: _Place, error: ErrorDetails) -> _Place:
     for part in error["loc"]:
         if isinstance(here.value, Mapping):
             is_missing = error["type"] == "missing" and part == error["loc"][-1]
-            if is_missing or _key(here.value, part) in here.value:  # else a name that pydantic gives to a type
+            if is_missing or _key(here.value, part) in here.value:
+                # Else a name that pydantic gives to a type.
                 here = keyed = here.within(str(part))
-        elif isinstance(here.value, (list, tuple)) and isinstance(part, int) and part < len(here.value):
+        elif (
+            isinstance(here.value, (list, tuple))
+            and isinstance(part, int)
+            and part < len(here.value)
+        ):
             here = here.within(part)
     return keyed
 
 
 def _key(values: Mapping[Any, Any], part: str | int) -> Any:
-    """Returns a key of a mapping by its text, in which YAML may have read a number; the text itself without one."""
+    """Returns a key of a mapping by its text, in which YAML may have read a number.
+
+    The text itself without one.
+    """
     return next((key for key in values if str(key) == str(part)), part)
 
 
@@ -123,14 +157,24 @@ def _unknown(place: _Place, where: str) -> str:
     for other in kinds[1:]:
         if name in other and "kind" in other and "kind" in kinds[0]:
             kind = _words_of(other["kind"])[0]
-            return f"{key} is a setting of kind {kind}, not of {group.value['kind']}: remove it with ~{key}."
+            return (
+                f"{key} is a setting of kind {kind}, "
+                f"not of {group.value['kind']}: remove it with ~{key}."
+            )
     near, every = list(kinds[0]) if kinds else [], list(dict.fromkeys(keys(place.schema)))
     same = [known for known in every if known.rpartition(".")[2] == name]
-    hint = did_you_mean(name, same, same) or did_you_mean(name, near) or did_you_mean(_dotted(place.path), every)
+    hint = (
+        did_you_mean(name, same, same)
+        or did_you_mean(name, near)
+        or did_you_mean(_dotted(place.path), every)
+    )
     hint = hint or f": {_dotted(group.path, where) or 'a configuration'} has {', '.join(near)}."
     if "files" in near and re.fullmatch(r".+\.[a-z]\w*", str(place.value), re.IGNORECASE):
         file = f"{key}={place.value}"
-        hint += f" There is no file {file} either: check its path; in quotes it is 'files=[\"{file}\"]'."
+        hint += (
+            f" There is no file {file} either: check its path; in quotes it is "
+            f"'files=[\"{file}\"]'."
+        )
     return f"unknown key '{key}'{hint}"
 
 
@@ -155,11 +199,18 @@ def options(schema: Schema, node: Schema) -> list[Schema]:
     while "$ref" in node:
         node = schema["$defs"][node["$ref"].rpartition("/")[2]]
     choices = node.get("anyOf") or node.get("oneOf")
-    return [node] if choices is None else [option for choice in choices for option in options(schema, choice)]
+    return (
+        [node]
+        if choices is None
+        else [option for choice in choices for option in options(schema, choice)]
+    )
 
 
 def _below(option: Schema, part: str | int) -> Schema | None:
-    """Returns the JSON Schema of a key or of an entry of a list of one type; None if it has no such part."""
+    """Returns the JSON Schema of a key or of an entry of a list of one type.
+
+    None if it has no such part.
+    """
     if isinstance(part, int):
         return option.get("items")
     below = option.get("properties", {}).get(part) or option.get("additionalProperties")
@@ -167,7 +218,8 @@ def _below(option: Schema, part: str | int) -> Schema | None:
 
 
 def is_text(schema: Schema, path: Path, written: str) -> bool:
-    """Returns whether a value is a text, whatever it looks like: 001, on, or null in a list of names.
+    """Returns whether a value is a text, whatever it looks like:
+    001, on, or null in a list of names.
 
     Args:
         schema: JSON Schema of the class.
@@ -178,11 +230,18 @@ def is_text(schema: Schema, path: Path, written: str) -> bool:
     for part in path:
         parts = [_below(option, part) for option in choices]
         choices = [option for node in parts if node is not None for option in options(schema, node)]
-    types = {option.get("type") for option in choices} | ({"string"} if path[:1] == ("defaults",) else set())
+    types = {option.get("type") for option in choices} | (
+        {"string"} if path[:1] == ("defaults",) else set()
+    )
     if "string" not in types or types & {"number", "integer", "boolean"}:
         return False
-    is_group = any(kind in types and written.startswith(mark) for kind, mark in (("object", "{"), ("array", "[")))
-    is_null = written.lower() in ("null", "~", "") and (isinstance(path[-1], str) or "null" in types)
+    is_group = any(
+        kind in types and written.startswith(mark)
+        for kind, mark in (("object", "{"), ("array", "["))
+    )
+    is_null = written.lower() in ("null", "~", "") and (
+        isinstance(path[-1], str) or "null" in types
+    )
     return not is_group and not is_null
 
 
@@ -229,7 +288,9 @@ def _array(node: Schema, schema: Schema) -> str:
 def _range(node: Schema) -> str:
     """Describes a number and its limits."""
     noun = _NOUNS[node["type"]]
-    low, above, high, below = (node.get(key) for key in ("minimum", "exclusiveMinimum", "maximum", "exclusiveMaximum"))
+    low, above, high, below = (
+        node.get(key) for key in ("minimum", "exclusiveMinimum", "maximum", "exclusiveMaximum")
+    )
     if (low, high, below) == (None, None, None) and above == 0:
         return f"a positive {noun}"
     if low in (0, 1) and (above, high, below) == (None, None, None):
@@ -237,5 +298,7 @@ def _range(node: Schema) -> str:
     if low is not None and high is not None:
         return f"a {noun} from {low:,g} to {high:,g}"
     limits = {"at least": low, "above": above, "at most": high, "below": below}
-    words = " and ".join(f"{name} {limit:,g}" for name, limit in limits.items() if limit is not None)
+    words = " and ".join(
+        f"{name} {limit:,g}" for name, limit in limits.items() if limit is not None
+    )
     return f"a {noun} {words}".rstrip()

@@ -1,10 +1,11 @@
 """Text files of users, in any encoding, and the cells of their tables.
 
-Windows programs write Windows-1252 (Motive, Nexus) or UTF-16 (Excel's "Unicode text"); German and other versions of
-Excel separate cells by semicolons or tabs and write decimal commas.
+Windows programs write Windows-1252 (Motive, Nexus) or UTF-16 (Excel's "Unicode text"); German and
+other versions of Excel separate cells by semicolons or tabs and write decimal commas.
 
-Thousands may be grouped: 1,012.5 or 1.012,5 or 1'012.5 or 1 012.5. A number such as 1,012 is 1012 or 1.012. Other
-numbers decide: those of its column, such as 0,5, else those of the whole table; where none does, it is refused.
+Thousands may be grouped: 1,012.5 or 1.012,5 or 1'012.5 or 1 012.5. A number such as 1,012 is 1012
+or 1.012. Other numbers decide: those of its column, such as 0,5, else those of the whole table;
+where none does, it is refused.
 """
 
 import codecs
@@ -27,19 +28,27 @@ _MARKS: Final = (
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
-_START: Final = 4096  # bytes that show UTF-16 without a mark: every second one is zero in Western text
+_START: Final = (
+    4096  # bytes that show UTF-16 without a mark: every second one is zero in Western text
+)
 _NO_TEXT: Final = re.compile("[\0-\x08\x0e-\x19\x1b-\x1f]")
 _LAST: Final = 50  # lines at the end, which hold numbers, and show what separates cells
 _SEPARATOR: Final = re.compile(r'\A"?sep=.*', re.IGNORECASE)  # Excel's first line
-_GROUPED: Final = re.compile(r"(?<=\d)['\u2019\u00a0\u2007\u2009\u202f ](?=\d{3}(?!\d))")  # marks between thousands
+# Marks between thousands.
+_GROUPED: Final = re.compile(r"(?<=\d)['\u2019\u00a0\u2007\u2009\u202f ](?=\d{3}(?!\d))")
 _BLANK_GROUPS: Final = re.compile(rf"[-+]?\d{{1,3}}(?:{_GROUPED.pattern}\d{{3}})+(?:[.,]\d*)?")
 _DOUBTFUL: Final = re.compile(r"[-+]?[1-9]\d{0,2}[.,]\d{3}")  # thousands, or three decimals
 _DECIMALS: Final = {  # numbers whose decimal mark is certain
-    ".": re.compile(r"[-+]?(?:\d*|\d{1,3}(?:,\d{3})+)\.\d+(?:[eE][-+]?\d+)?|[-+]?\d{1,3}(?:,\d{3}){2,}"),
-    ",": re.compile(r"[-+]?(?:\d*|\d{1,3}(?:\.\d{3})+),\d+(?:[eE][-+]?\d+)?|[-+]?\d{1,3}(?:\.\d{3}){2,}"),
+    ".": re.compile(
+        r"[-+]?(?:\d*|\d{1,3}(?:,\d{3})+)\.\d+(?:[eE][-+]?\d+)?|[-+]?\d{1,3}(?:,\d{3}){2,}"
+    ),
+    ",": re.compile(
+        r"[-+]?(?:\d*|\d{1,3}(?:\.\d{3})+),\d+(?:[eE][-+]?\d+)?|[-+]?\d{1,3}(?:\.\d{3}){2,}"
+    ),
 }
 _OTHER: Final = {".": ",", ",": "."}
-_HUNDREDS: Final = re.compile(r"[-+]?[1-9]\d{2}")  # as below a thousand in a column without decimals
+# As below a thousand in a column without decimals.
+_HUNDREDS: Final = re.compile(r"[-+]?[1-9]\d{2}")
 
 
 def read_text(path: str | Path) -> str:
@@ -53,15 +62,17 @@ def read_text(path: str | Path) -> str:
     except OSError as error:
         raise DataFileError(f"Cannot read {path}: {error.strerror}; check its path.") from error
     if text is None or _NO_TEXT.search(text):
-        raise DataFileError(f"{path} is not a text file: export it as text again, a table as CSV or TSV.")
+        raise DataFileError(
+            f"{path} is not a text file: export it as text again, a table as CSV or TSV."
+        )
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def decoded(content: bytes) -> str | None:
     """Returns bytes as text, None if they are none.
 
-    The byte-order mark determines the encoding. Without one it is UTF-16 if every second byte is zero, else UTF-8, and
-    Windows-1252 for what is not valid UTF-8, with a warning.
+    The byte-order mark determines the encoding. Without one it is UTF-16 if every second byte is
+    zero, else UTF-8, and Windows-1252 for what is not valid UTF-8, with a warning.
     """
     for encoding in _encodings(content):
         try:
@@ -70,8 +81,8 @@ def decoded(content: bytes) -> str | None:
             continue
         if encoding in ("cp1252", "latin-1") and not _NO_TEXT.search(text):
             warn(
-                "A text is not in UTF-8 and was read as Windows-1252: check names with accents or umlauts, or save "
-                "the file as UTF-8."
+                "A text is not in UTF-8 and was read as Windows-1252: check names with accents "
+                "or umlauts, or save the file as UTF-8."
             )
         return text
     return None
@@ -90,13 +101,15 @@ def _encodings(content: bytes) -> Sequence[str]:
 
 
 def read_rows(path: str | Path) -> Rows:
-    """Returns the cells of each line of a table, without blanks around them, decimal commas and grouped thousands.
+    """Returns the cells of each line of a table, without blanks around them,
+    decimal commas and grouped thousands.
 
-    Tabs, semicolons, commas or blanks separate cells, whichever comes first in half of the last lines.
+    Tabs, semicolons, commas or blanks separate cells, whichever comes first in half of the last
+    lines.
 
     Raises:
-        DataFileError: The file cannot be read, is not text, is damaged, or has a number such as 1,012 that may be 1012
-            or 1.012.
+        DataFileError: The file cannot be read, is not text, is damaged, or has a number such as
+            1,012 that may be 1012 or 1.012.
     """
     text = _SEPARATOR.sub("", read_text(path))
     lines = text.split("\n")
@@ -108,10 +121,15 @@ def read_rows(path: str | Path) -> Rows:
     try:
         rows = [*csv.reader(io.StringIO(text), delimiter=delimiter, skipinitialspace=True)]
     except csv.Error as error:
-        raise DataFileError(f"{path} is no table ({error}): export it as CSV or TSV again.") from error
+        raise DataFileError(
+            f"{path} is no table ({error}): export it as CSV or TSV again."
+        ) from error
     rows = [[cell.strip() for cell in row] for row in rows]
     if _GROUPED.search(text):
-        rows = [[_GROUPED.sub("", cell) if _BLANK_GROUPS.fullmatch(cell) else cell for cell in row] for row in rows]
+        rows = [
+            [_GROUPED.sub("", cell) if _BLANK_GROUPS.fullmatch(cell) else cell for cell in row]
+            for row in rows
+        ]
     return _with_points(rows, path)
 
 
@@ -126,7 +144,12 @@ def _with_points(rows: Rows, path: str | Path) -> Rows:
                 if mark is not None and _has_numbers(row):
                     seen.add(mark)
     everywhere = set[str]().union(*marks.values())
-    bare = {column for row in rows for column, cell in enumerate(row) if not everywhere and _HUNDREDS.fullmatch(cell)}
+    bare = {
+        column
+        for row in rows
+        for column, cell in enumerate(row)
+        if not everywhere and _HUNDREDS.fullmatch(cell)
+    }
     if "," not in everywhere and not bare and not any("," in cell for row in rows for cell in row):
         return rows
     result = list[list[str]]()
@@ -140,9 +163,9 @@ def _with_points(rows: Rows, path: str | Path) -> Rows:
                     if len(known) != 1:
                         whole, point = re.sub("[.,]", "", cell), cell.replace(",", ".")
                         raise DataFileError(
-                            f"{path}, line {line}, column {column + 1}: '{cell}' is {whole} or {point}, and no other "
-                            f"number tells which: write {whole} without a mark between thousands, or {point}0, with a "
-                            "decimal point."
+                            f"{path}, line {line}, column {column + 1}: '{cell}' is {whole} or "
+                            f"{point}, and no other number tells which: write {whole} without a "
+                            f"mark between thousands, or {point}0, with a decimal point."
                         )
                     (mark,) = known
                 if mark is not None:
@@ -152,7 +175,9 @@ def _with_points(rows: Rows, path: str | Path) -> Rows:
 
 
 def _certain(cell: str) -> str | None:
-    """Returns the decimal mark of a number, None where it is no number or may have grouped thousands instead."""
+    """Returns the decimal mark of a number, None where it is no number
+    or may have grouped thousands instead.
+    """
     if _DOUBTFUL.fullmatch(cell):
         return None
     return next((mark for mark, form in _DECIMALS.items() if form.fullmatch(cell)), None)

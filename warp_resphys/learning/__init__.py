@@ -1,4 +1,6 @@
-"""Identification of parameters, reconstruction of residual forces, and networks that predict these forces."""
+"""Identification of parameters, reconstruction of residual forces,
+and networks that predict these forces.
+"""
 
 from ..settings.learning import Bounds as Bounds
 from ..settings.learning import Prior as Prior

@@ -1,8 +1,9 @@
-"""Predictions without physics: a body at rest, interpolation and regression over trials, a linear model in time.
+"""Predictions without physics: a body at rest, interpolation and regression over trials,
+a linear model in time.
 
-They have what simulators have, the inputs of a trial and the points before time zero, learn from the same trials, and
-predict all frames: what learns each frame by itself holds its last value after the end of the longest training trial.
-Their settings are chosen by leaving training trials out.
+They have what simulators have, the inputs of a trial and the points before time zero, learn from
+the same trials, and predict all frames: what learns each frame by itself holds its last value after
+the end of the longest training trial. Their settings are chosen by leaving training trials out.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,9 @@ _MODES: Final = (2, 4, 8, 16)
 _LINEAR_RIDGES: Final = (1e-9, 1e-6, 1e-4, 1e-2)
 _EXACT: Final = 1e-8  # least singular value of a fit of other coordinates, relative to the largest
 _FOLDS: Final = 4
-_LARGEST: Final = 1e3  # coordinate of a linear model, over the root mean square displacement in its training
+_LARGEST: Final = (
+    1e3  # coordinate of a linear model, over the root mean square displacement in its training
+)
 
 
 def predictions(trials: PlainTrials, asked: PlainTrials) -> dict[str, Prediction]:
@@ -36,11 +39,11 @@ def predictions(trials: PlainTrials, asked: PlainTrials) -> dict[str, Prediction
         asked: trials to predict; their values are not used.
 
     Returns:
-        ``rest``: nothing moves. ``interpolation``: straight lines from zero inputs through the trials, frame by frame,
-        constant beyond the outermost; the mean of trials that nothing distinguishes. ``regression``: ridge
-        regression, see `regression`, where `distinguished`. ``linear``: a linear state-space model with powers and
-        products of the inputs (Proctor, Brunton and Kutz, SIAM Journal on Applied Dynamical Systems 15(1), 2016), for
-        motions.
+        ``rest``: nothing moves. ``interpolation``: straight lines from zero inputs through the
+        trials, frame by frame, constant beyond the outermost; the mean of trials that nothing
+        distinguishes. ``regression``: ridge regression, see `regression`, where `distinguished`.
+        ``linear``: a linear state-space model with powers and products of the inputs (Proctor,
+        Brunton and Kutz, SIAM Journal on Applied Dynamical Systems 15(1), 2016), for motions.
     """
     result = {REST: at_rest(asked), "interpolation": interpolation(trials, asked)}
     if distinguished(trials):
@@ -56,14 +59,17 @@ def at_rest(asked: PlainTrials) -> Prediction:
 
 
 def linear(trials: PlainTrials, asked: PlainTrials) -> Prediction:
-    """Predicts motions by a linear model of the displacements in two frames, in principal components, and of inputs.
+    """Predicts motions by a linear model of the displacements in two frames, in principal
+    components, and of inputs.
 
-    The model is linear in the powers and products of the inputs up to a degree. The degree, the number of components
-    and the ridge are those of the least error of roll-outs of trials that are left out; a single training trial is
-    itself rolled out, with a degree of one. Coordinates that some trials do not show follow from the components.
+    The model is linear in the powers and products of the inputs up to a degree. The degree, the
+    number of components and the ridge are those of the least error of roll-outs of trials that are
+    left out; a single training trial is itself rolled out, with a degree of one. Coordinates that
+    some trials do not show follow from the components.
     """
     seen = np.asarray(np.isfinite(trials.moved).any(1))  # (R, P)
-    if not (common := seen.all(0)).any():  # The trials that show the coordinate that most of them and the others show.
+    if not (common := seen.all(0)).any():
+        # The trials that show the coordinate that most of them and the others show.
         wanted = seen.sum(0) * (1.0 + len(seen) * np.isfinite(asked.first).any(0))
         return linear(trials.select(seen[:, wanted.argmax()]), asked)
     begun = np.isfinite(np.concatenate([trials.first, asked.first])).all(0)
@@ -79,7 +85,10 @@ def linear(trials: PlainTrials, asked: PlainTrials) -> Prediction:
         vectors = scipy.linalg.eigh(everything.T @ everything, subset_by_index=largest)[1][:, ::-1]
     basis = vectors / size
     starts, most = trials.displaced[:, shown] @ basis, basis.shape[1]
-    z = [np.concatenate([start[None], path @ basis]) for start, path in zip(starts, moved, strict=True)]
+    z = [
+        np.concatenate([start[None], path @ basis])
+        for start, path in zip(starts, moved, strict=True)
+    ]
     squares = [np.square(path / size).sum() for path in moved]
     sizes, folds = sorted({min(m, most) for m in _MODES}), min(_FOLDS, len(moved))
     best, chosen = np.inf, (1, 1, _LINEAR_RIDGES[-1])
@@ -93,31 +102,53 @@ def linear(trials: PlainTrials, asked: PlainTrials) -> Prediction:
                 kept = [k for k in range(len(z)) if folds == 1 or k % folds != fold]
                 matrix = _fitted([sums[k] for k in kept], most, modes, ridge)
                 rolled = _rolled(matrix, starts[out, :modes], driving[out])
-                for row, k in zip(rolled, out, strict=True):  # the components that are left out do not move
+                # The components that are left out do not move.
+                for row, k in zip(rolled, out, strict=True):
                     known = z[k][1:, :modes]
-                    off = np.square(row[: len(known)] - known).sum() + squares[k] - np.square(known).sum()
+                    off = (
+                        np.square(row[: len(known)] - known).sum()
+                        + squares[k]
+                        - np.square(known).sum()
+                    )
                     error += float(np.sqrt(max(off, 0.0) / len(known)))
             if error < best * (1.0 - 1e-9):
                 best, chosen = error, (degree, modes, ridge)
     degree, modes, ridge = chosen
     driving = driving_terms(trials, trials, degree)
-    matrix = _fitted([_sums(path, acting) for path, acting in zip(z, driving, strict=True)], most, modes, ridge)
-    rolled = _rolled(matrix, (asked.displaced[:, shown] @ basis)[:, :modes], driving_terms(asked, trials, degree))
+    matrix = _fitted(
+        [_sums(path, acting) for path, acting in zip(z, driving, strict=True)], most, modes, ridge
+    )
+    rolled = _rolled(
+        matrix, (asked.displaced[:, shown] @ basis)[:, :modes], driving_terms(asked, trials, degree)
+    )
     values = np.full(asked.values.shape, np.nan)
     values[..., shown] = asked.origin[:, None, shown] + rolled @ basis[:, :modes].T * size**2
     for column in np.flatnonzero(seen.any(0) & ~shown):
-        there = [np.isfinite(path[: len(of) - 1, column]) for path, of in zip(trials.moved, z, strict=True)]
+        there = [
+            np.isfinite(path[: len(of) - 1, column])
+            for path, of in zip(trials.moved, z, strict=True)
+        ]
         known = np.concatenate([of[1:, :modes][where] for of, where in zip(z, there, strict=True)])
         wanted = np.concatenate(
-            [path[: len(where), column][where] for path, where in zip(trials.moved, there, strict=True)]
+            [
+                path[: len(where), column][where]
+                for path, where in zip(trials.moved, there, strict=True)
+            ]
         )
-        values[..., column] = asked.origin[:, None, column] + rolled @ np.linalg.lstsq(known, wanted, rcond=_EXACT)[0]
+        values[..., column] = (
+            asked.origin[:, None, column] + rolled @ np.linalg.lstsq(known, wanted, rcond=_EXACT)[0]
+        )
     powers = f"degree {degree}, " if degree > 1 else ""
-    return Prediction(values, f"{powers}{modes} component{'s' if modes > 1 else ''}, ridge {ridge:g}")
+    return Prediction(
+        values, f"{powers}{modes} component{'s' if modes > 1 else ''}, ridge {ridge:g}"
+    )
 
 
 def _without_gaps(moved: FloatArray) -> FloatArray:
-    """(T', P) displacements (T, P) up to the last frame that shows any; coordinates that are never seen do not move."""
+    """(T', P) displacements (T, P) up to the last frame that shows any.
+
+    Coordinates that are never seen do not move.
+    """
     seen = np.isfinite(moved)
     last = int(np.flatnonzero(seen.any(1))[-1]) + 1
     frames, result = np.arange(last), np.nan_to_num(moved[:last])
@@ -142,8 +173,11 @@ def _sums(z: FloatArray, driving: FloatArray) -> tuple[FloatArray, FloatArray]:
     return rows.T @ rows, rows.T @ z[2:]
 
 
-def _fitted(sums: Sequence[tuple[FloatArray, FloatArray]], most: int, modes: int, ridge: float) -> FloatArray:
-    """The matrix from coordinates of two frames, and what drives both ends of the next interval, to the next frame.
+def _fitted(
+    sums: Sequence[tuple[FloatArray, FloatArray]], most: int, modes: int, ridge: float
+) -> FloatArray:
+    """The matrix from coordinates of two frames, and what drives both ends
+    of the next interval, to the next frame.
 
     Args:
         sums: normal equations of each trial.
@@ -154,7 +188,8 @@ def _fitted(sums: Sequence[tuple[FloatArray, FloatArray]], most: int, modes: int
     gram, moment = (np.sum(parts, axis=0) for parts in zip(*sums, strict=True))
     kept = np.r_[:modes, most : most + modes, 2 * most : len(gram)]
     gram = gram[np.ix_(kept, kept)]
-    gram += (ridge * np.trace(gram) / len(gram) or 1.0) * np.eye(len(gram))  # Too few frames predict no motion.
+    # Too few frames predict no motion.
+    gram += (ridge * np.trace(gram) / len(gram) or 1.0) * np.eye(len(gram))
     return np.asarray(np.linalg.solve(gram, moment[kept, :modes]))
 
 

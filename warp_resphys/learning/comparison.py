@@ -1,4 +1,6 @@
-"""Several models on the same tested trials: roll-outs, errors, prediction intervals, and what explains errors."""
+"""Several models on the same tested trials: roll-outs, errors,
+prediction intervals, and what explains errors.
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -68,9 +70,11 @@ class Comparison:
         motions: observed trials.
         train: names of the trials that were learned from.
         groups: names of the tested trials by input scale; ``1``, the original inputs, is first.
-        calibration: names of the trials that prediction intervals come from; none without intervals.
+        calibration: names of the trials that prediction intervals come from; none without
+            intervals.
         horizons: durations of whose errors there is a table [s].
-        reconstructed: (R, T, M, 3) reconstructed points of the trials with the original inputs [m]; None without any.
+        reconstructed: (R, T, M, 3) reconstructed points of the trials with the original inputs [m];
+            None without any.
         parts: workers and files of the roll-outs.
     """
 
@@ -95,47 +99,80 @@ class Comparison:
 
     @cached_property
     def _growing(self) -> list[str]:
-        """Models whose errors in the largest training trial are known as if they were identified without it.
+        """Models whose errors in the largest training trial are known
+        as if they were identified without it.
 
         Not those with a network, which has seen the trial.
         """
 
         def grows(model: Model) -> bool:
-            known, trained = model.identified.uncertainty, model.learned is not None or model.identified.actuator
-            return model.has_intervals and not trained and known is not None and self._largest[0] in known.left_out
+            known = model.identified.uncertainty
+            trained = model.learned is not None or model.identified.actuator
+            return (
+                model.has_intervals
+                and not trained
+                and known is not None
+                and self._largest[0] in known.left_out
+            )
 
         many = self.calibration and len(self.train) > 1
         return [name for name, model in self.models.items() if grows(model)] if many else []
 
     def _below(self, model: str) -> str | None:
-        """Name of the model whose growth a model has: itself, or the simulator that its networks correct, if any."""
+        """Name of the model whose growth a model has:
+        itself, or the simulator that its networks correct, if any.
+        """
         used = self.models.get(model)
         if used is None or model in self._growing:
             return None if used is None else model
-        corrected = bool(used.identified.actuator) if used.learned is None else not used.learned.replaces_simulator
+        corrected = (
+            bool(used.identified.actuator)
+            if used.learned is None
+            else not used.learned.replaces_simulator
+        )
         for other in self._growing if corrected else ():
             if self._same_simulator(other, model):
                 return other
         return None
 
     def _same_simulator(self, model: str, other: str) -> bool:
-        """Whether two models have the same simulator with the same parameters, whatever was learned on top of it."""
+        """Whether two models have the same simulator with the same parameters,
+        whatever was learned on top of it.
+        """
         one, two = self.models[model], self.models[other]
-        return one.simulator is two.simulator and one.identified.parameters == two.identified.parameters
+        return (
+            one.simulator is two.simulator
+            and one.identified.parameters == two.identified.parameters
+        )
 
     def _same_motions(self, model: str, other: str) -> bool:
-        """Whether two models have the same simulator with all that was identified, and no network."""
+        """Whether two models have the same simulator with all
+        that was identified, and no network.
+        """
         one, two = self.models[model], self.models[other]
-        known = [(m.identified.of_trials, m.identified.placement, m.identified.actuator) for m in (one, two)]
+        known = [
+            (m.identified.of_trials, m.identified.placement, m.identified.actuator)
+            for m in (one, two)
+        ]
         networks = one.learned, two.learned
-        return networks == (None, None) and self._same_simulator(model, other) and known[0] == known[1]
+        return (
+            networks == (None, None) and self._same_simulator(model, other) and known[0] == known[1]
+        )
 
     def _calibrating(self, model: str) -> list[str]:
-        """Names of the trials of the calibration, and of the largest training trial if the model grows by it."""
-        return [*dict.fromkeys([*self.calibration, *(self._largest[:1] if model in self._growing else ())])]
+        """Names of the trials of the calibration, and of the largest training trial
+        if the model grows by it.
+        """
+        return [
+            *dict.fromkeys(
+                [*self.calibration, *(self._largest[:1] if model in self._growing else ())]
+            )
+        ]
 
     def _used(self, names: Sequence[str]) -> FloatArray:
-        """(R, T, M, 3) observed points of some trials [m], NaN in frames that may be tested or gave first values."""
+        """(R, T, M, 3) observed points of some trials [m],
+        NaN in frames that may be tested or gave first values.
+        """
         motions, trials = self.motions, self.motions.trials
         observed = trials.observed[trials.rows(names)]
         learned = [row for row, name in enumerate(names) if name in self.train]
@@ -164,21 +201,30 @@ class Comparison:
 
     @cached_property
     def _rolled_out(self) -> tuple[dict[str, list[TrialPart]], dict[str, list[TrialPart]]]:
-        """Parts of the tested trials, and of those of the calibration, by model, after they were rolled out.
+        """Parts of the tested trials, and of those of the calibration,
+        by model, after they were rolled out.
 
         Models with equal motions, as where nothing that was learned is used, have the same parts.
         """
         new = list[TrialPart]()
 
-        def cut(models: Sequence[str], names: Callable[[str], Sequence[str]], label: str) -> dict[str, list[TrialPart]]:
+        def cut(
+            models: Sequence[str], names: Callable[[str], Sequence[str]], label: str
+        ) -> dict[str, list[TrialPart]]:
             parts = dict[str, list[TrialPart]]()
             for model in models:
                 used = self.models[model]
                 made = used.simulator, self.motions, names(model), used.learned, used.identified
-                alike = (o for o in parts if self._same_motions(o, model) and [*names(o)] == [*names(model)])
+                alike = (
+                    o
+                    for o in parts
+                    if self._same_motions(o, model) and [*names(o)] == [*names(model)]
+                )
                 same = next(alike, None)
                 if same is None:
-                    parts[model] = rollout_parts(*made, self.parts.batch, self.filmed, f"{label}{model}")
+                    parts[model] = rollout_parts(
+                        *made, self.parts.batch, self.filmed, f"{label}{model}"
+                    )
                     new.extend(parts[model])
                 else:
                     parts[model] = parts[same]
@@ -201,8 +247,14 @@ class Comparison:
 
     @property
     def _first_frames(self) -> Mapping[str, Mapping[str, float]]:
-        """First frames of trials from which values of some model were estimated, see `Identified`."""
-        return {o: shown for model in self.models.values() for o, shown in model.identified.first_frames.items()}
+        """First frames of trials from which values of some model were estimated, see
+        `Identified`.
+        """
+        return {
+            o: shown
+            for model in self.models.values()
+            for o, shown in model.identified.first_frames.items()
+        }
 
     @cached_property
     def _without_physics(self) -> tuple[dict[str, FloatArray], dict[str, str], dict[str, str]]:
@@ -210,12 +262,19 @@ class Comparison:
 
     @cached_property
     def simulated(self) -> dict[str, FloatArray]:
-        """(R, T, M, 3) predicted points of the tested trials by model [m], first those without physics."""
-        return self._without_physics[0] | {model: self._in_order(model, "observed") for model in self.models}
+        """(R, T, M, 3) predicted points of the tested trials by model [m],
+        first those without physics.
+        """
+        return self._without_physics[0] | {
+            model: self._in_order(model, "observed") for model in self.models
+        }
 
     @cached_property
     def loads(self) -> dict[str, FloatArray]:
-        """(R, T, S, 6) readings of the force sensors in tested trials by model [N, N m]; empty without sensors."""
+        """(R, T, S, 6) readings of the force sensors in tested trials by model [N, N m].
+
+        Empty without sensors.
+        """
         if not self.motions.sensors:
             return {}
         as_points = _loads_as_points(self.motions)
@@ -246,19 +305,30 @@ class Comparison:
         found: dict[str, Mapping[str, Sensitivity]] = {}
         for name, model in self.models.items() if self.motions.trials.bound is not None else ():
             replaced = model.learned is not None and model.learned.replaces_simulator
-            if replaced or not model.has_intervals or (uncertain and model.identified.uncertainty is None):
+            if (
+                replaced
+                or not model.has_intervals
+                or (uncertain and model.identified.uncertainty is None)
+            ):
                 continue
             same = next((other for other in found if self._same_simulator(other, name)), None)
             found[name] = (
-                sensitivities(model.simulator, self.motions, names, model.identified, self.parts.batch)
+                sensitivities(
+                    model.simulator, self.motions, names, model.identified, self.parts.batch
+                )
                 if same is None
                 else found[same]
             )
         return found
 
-    def _spreads(self, names: Sequence[str], linear: Linear, left_out: bool = False) -> dict[str, FloatArray]:
+    def _spreads(
+        self, names: Sequence[str], linear: Linear, left_out: bool = False
+    ) -> dict[str, FloatArray]:
         trials, models = self.motions.trials, self.models
-        spreads = {m: parameter_spread(trials, names, models[m].identified, x, left_out) for m, x in linear.items()}
+        spreads = {
+            m: parameter_spread(trials, names, models[m].identified, x, left_out)
+            for m, x in linear.items()
+        }
         return {model: spread for model, spread in spreads.items() if spread is not None}
 
     @cached_property
@@ -267,12 +337,26 @@ class Comparison:
         return self._spreads(self.groups["1"], self._linear)
 
     def errors(self) -> ErrorTables:
-        """Returns all that errors.json has: tables, baselines, displacements, free fits and intervals."""
+        """Returns all that errors.json has: tables,
+        baselines, displacements, free fits and intervals.
+        """
         test, (_, plain, missing) = self.groups["1"], self._without_physics
-        networks = {name: model.learned for name, model in self.models.items() if model.learned is not None}
-        left = {name: self._in_order(name, "left") for name, learned in networks.items() if learned.range_ is not None}
+        networks = {
+            name: model.learned for name, model in self.models.items() if model.learned is not None
+        }
+        left = {
+            name: self._in_order(name, "left")
+            for name, learned in networks.items()
+            if learned.range_ is not None
+        }
         compared = ComparedModels(
-            *(self.motions, self.train, self.groups, self.simulated, left, self.reconstructed, self.horizons),
+            self.motions,
+            self.train,
+            self.groups,
+            self.simulated,
+            left,
+            self.reconstructed,
+            self.horizons,
             first_frames=self._first_frames,
             loads=self.loads,
         )
@@ -282,7 +366,9 @@ class Comparison:
         content["baselines"] = plain
         if missing:
             content["missing_baselines"] = missing
-        sideways = dict(zip(self.names, self._in_order([*self.models][-1], "sideways").tolist(), strict=True))
+        sideways = dict(
+            zip(self.names, self._in_order([*self.models][-1], "sideways").tolist(), strict=True)
+        )
         if known := {name: sideways[name] for name in test if math.isfinite(sideways[name])}:
             content["sideways_mm"] = known
         if any((fits := self._free_fits()).values()):
@@ -294,7 +380,9 @@ class Comparison:
     def _free_fits(self) -> dict[str, list[FreeFit]]:
         """Returns what would remain of the errors if something were free, by model."""
         names, fits = self.groups["1"], {}
-        observed = dict(zip(names, counted(self.motions, self.train, names, self._first_frames), strict=True))
+        observed = dict(
+            zip(names, counted(self.motions, self.train, names, self._first_frames), strict=True)
+        )
         for model, linear in self._linear.items():
             predicted = dict(zip(names, self.simulated[model][: len(names)], strict=True))
             fits[model] = free_fits(self.motions.trials, observed, predicted, linear)
@@ -303,27 +391,42 @@ class Comparison:
     def _intervals(self) -> IntervalTable:
         """Prediction intervals by model and their coverage of the tested trials, see `intervals`.
 
-        Trials of the training are predicted as if the parameters were identified without them (`left_out_changes`), so
-        that the one with the largest displacement shows how errors grow beyond the training of the others. Models with
-        a network have the growth of the simulator below it. The intervals of a robot, which does not know the variance
-        due to the parameters, are `without_spread`.
+        Trials of the training are predicted as if the parameters were identified without them
+        (`left_out_changes`), so that the one with the largest displacement shows how errors grow
+        beyond the training of the others. Models with a network have the growth of the simulator
+        below it. The intervals of a robot, which does not know the variance due to the parameters,
+        are `without_spread`.
         """
         motions, trials, test = self.motions, self.motions.trials, self.groups["1"]
         rest = rest_places(trials)
         target = counted(motions, self.train, test, self._first_frames)
         names = [*dict.fromkeys(chain(self.calibration, *map(self._calibrating, self._growing)))]
         linear = self._linearised(names, uncertain=True)
-        changes = {m: left_out_changes(trials, names, self.models[m].identified, x) for m, x in linear.items()}
-        plain, *_ = without_physics(motions, self.calibration, self.train, self._first_frames, left_out=True)
-        simulated: dict[str, tuple[Sequence[str], FloatArray]] = {m: (self.calibration, x) for m, x in plain.items()}
+        changes = {
+            m: left_out_changes(trials, names, self.models[m].identified, x)
+            for m, x in linear.items()
+        }
+        plain, *_ = without_physics(
+            motions, self.calibration, self.train, self._first_frames, left_out=True
+        )
+        simulated: dict[str, tuple[Sequence[str], FloatArray]] = {
+            m: (self.calibration, x) for m, x in plain.items()
+        }
         for model, parts in self._rolled_out[1].items():
             of_parts, change = [*chain(*(part.names for part in parts))], changes.get(model)
             made = self.parts.joined(parts, "observed", trials.observed.shape[1])
-            simulated[model] = of_parts, made if change is None else made + change[[names.index(n) for n in of_parts]]
+            simulated[model] = (
+                of_parts,
+                made if change is None else made + change[[names.index(n) for n in of_parts]],
+            )
         spreads = self._spreads(names, linear, left_out=True)
         whole, alone = dict[str, Intervals | None](), dict[str, Intervals | None]()
         for model, (shown, made) in simulated.items():
-            spread = None if model not in spreads else spreads[model][[names.index(name) for name in shown]]
+            spread = (
+                None
+                if model not in spreads
+                else spreads[model][[names.index(name) for name in shown]]
+            )
             predicted = predicted_trials(trials, shown, made, self._used(shown), spread)
             whole[model] = self._calibrated(model, predicted)
             known = {name: replace(trial, spread=None) for name, trial in predicted.items()}
@@ -334,7 +437,9 @@ class Comparison:
                 continue
             new = self.simulated[model][: len(test)]
             tested = predicted_trials(trials, test, new, target, self.spreads.get(model))
-            covered = coverage({name: intervals.covered(trial, rest) for name, trial in tested.items()})
+            covered = coverage(
+                {name: intervals.covered(trial, rest) for name, trial in tested.items()}
+            )
             models[model] = {**intervals.plain(), **covered}
             if (of_robot := self._grown(model, alone)) is not None:
                 models[model]["without_spread"] = of_robot.plain()
@@ -344,7 +449,9 @@ class Comparison:
         return {"level": LEVEL, "calibrated_on": split, "models": models}
 
     def _calibrated(self, model: str, predicted: Mapping[str, Predicted]) -> Intervals | None:
-        """Calibrates intervals of a model on trials that it predicted, of which the largest one shows any growth."""
+        """Calibrates intervals of a model on trials that it predicted,
+        of which the largest one shows any growth.
+        """
         rest = rest_places(self.motions.trials)
         intervals = Intervals.calibrated({name: predicted[name] for name in self.calibration}, rest)
         if intervals is None or model not in self._growing:
@@ -354,17 +461,26 @@ class Comparison:
         return intervals.growing(predicted[largest], self._reach(others), reach, rest)
 
     def _grown(self, model: str, calibrated: Mapping[str, Intervals | None]) -> Intervals | None:
-        """Returns the intervals of a model with the growth of the one that shows it, see `_below`."""
+        """The intervals of a model with the growth of the one that shows it, see `_below`."""
         own, below = calibrated[model], calibrated.get(self._below(model) or "")
-        return own if own is None or below is None else replace(own, reach=below.reach, growth=below.growth)
+        return (
+            own
+            if own is None or below is None
+            else replace(own, reach=below.reach, growth=below.growth)
+        )
 
 
 def _loads_as_points(motions: ObservedMotions) -> ObservedMotions:
-    """Returns motions whose observed points are forces and moments, two of each sensor, for predictions from data."""
+    """Returns motions whose observed points are forces and moments,
+    two of each sensor, for predictions from data.
+    """
     trials = motions.trials
     readings = np.stack([*trials.loads.values()], 2).reshape(*trials.times.shape, -1, 3)
     names = tuple(f"{name} {kind}" for name in trials.loads for kind in ("force", "moment"))
     known = np.isfinite(readings)
-    first = np.take_along_axis(readings, known.argmax(axis=1)[:, None], axis=1)[:, 0]  # NaN where there is none
-    changed = replace(trials, labels=names, observed=readings, held=first, smoothed=None, bound=None)
+    # NaN where there is none
+    first = np.take_along_axis(readings, known.argmax(axis=1)[:, None], axis=1)[:, 0]
+    changed = replace(
+        trials, labels=names, observed=readings, held=first, smoothed=None, bound=None
+    )
     return replace(motions, trials=replace(changed, loads={}), sensors={})

@@ -1,4 +1,6 @@
-"""Errors of models on tested trials: in tables, by trial, marker, phase, horizon and scale of the inputs."""
+"""Errors of models on tested trials: in tables, by trial,
+marker, phase, horizon and scale of the inputs.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +17,14 @@ from ..io.errors import InputError
 from .evaluation import first_frame, used_frames
 from .identification.sensitivity import FreeFit
 from .intervals import IntervalTable
-from .metrics import ErrorSummary, TrialErrors, errors_per_marker, marker_errors, summarise, summarise_trajectories
+from .metrics import (
+    ErrorSummary,
+    TrialErrors,
+    errors_per_marker,
+    marker_errors,
+    summarise,
+    summarise_trajectories,
+)
 from .observed_motions import ObservedMotions
 
 # Of `beyond_training`, over the largest value of the training: up to there, a trial is within it.
@@ -43,13 +52,13 @@ class ErrorTables(TypedDict, total=False):
     errors_mm: dict[str, ErrorSummary]  # by model
     per_trajectory: list[TrialErrors]
     errors_vs_reconstruction_mm: dict[str, ErrorSummary]  # by model
-    per_marker: dict[str, dict[str, float | None]]  # mean [mm] by model and marker; None where a roll-out diverged
+    per_marker: dict[str, dict[str, float | None]]  # mean [mm] by model and marker; None: diverged
     orientations_deg: dict[str, dict[str, float | None]]  # mean by model and rigid body
     horizons: dict[str, dict[str, ErrorSummary]]  # by duration [s] and model
     phases: dict[str, dict[str, ErrorSummary]]  # by phase of the inputs and model
     forces: dict[str, ForceErrors]  # by sensor
     range: dict[str, RangeExits]  # by model with a network
-    beyond: dict[str, dict[str, float]]  # by trial that lies beyond the training, see `beyond_training`
+    beyond: dict[str, dict[str, float]]  # by trial beyond the training, see `beyond_training`
     scales: dict[str, dict[str, ErrorSummary]]  # by scale of the inputs and model
     scales_range: dict[str, dict[str, RangeExits]]
     baselines: dict[str, str]  # settings of the models without physics, in words
@@ -68,9 +77,11 @@ class ComparedModels:
         motions: observed trials.
         train: names of the trials that were learned from, of which only the rest is tested.
         groups: names of the R tested trials by input scale; ``1``, the original inputs, is first.
-        simulated: (R, T, M, 3) observed points of the roll-outs by model [m], NaN where a roll-out diverged.
+        simulated: (R, T, M, 3) observed points of the roll-outs by model [m], NaN where a roll-out
+            diverged.
         left: (R,) steps at which trials left the training range, or -1, by model with a network.
-        reconstructed: (R, T, M, 3) reconstructed points of the trials with the original inputs [m]; None without any.
+        reconstructed: (R, T, M, 3) reconstructed points of the trials with the original inputs [m];
+            None without any.
         horizons: durations of whose errors there is a table [s].
         first_frames: that do not count, see `Identified`.
         loads: (R, T, S, 6) readings of force sensors by model [N, N m].
@@ -93,7 +104,9 @@ class ComparedModels:
         points = counted(self.motions, self.train, every, self.first_frames)
         observed = as_markers(points, trials.labels)
         first = [first_frame(trials, [name]) for name in every]
-        models = {model: as_markers(values, trials.labels) for model, values in self.simulated.items()}
+        models = {
+            model: as_markers(values, trials.labels) for model, values in self.simulated.items()
+        }
         test = {model: values[:count] for model, values in models.items()}
         if self.reconstructed is not None:
             test["reconstruction"] = self.reconstructed
@@ -102,19 +115,31 @@ class ComparedModels:
         content: ErrorTables = {
             "errors_mm": {model: summarise(rows) for model, rows in errors.items()},
             "per_trajectory": [
-                {**row, "amplitude_mm": sizes[row["name"]]} for row in summarise_trajectories(tuple(names), errors)
+                {**row, "amplitude_mm": sizes[row["name"]]}
+                for row in summarise_trajectories(tuple(names), errors)
             ],
         }
         if self.reconstructed is not None:
-            against = {m: _errors(x, self.reconstructed, first) for m, x in test.items() if m != "reconstruction"}
-            content["errors_vs_reconstruction_mm"] = {model: summarise(rows) for model, rows in against.items()}
+            against = {
+                m: _errors(x, self.reconstructed, first)
+                for m, x in test.items()
+                if m != "reconstruction"
+            }
+            content["errors_vs_reconstruction_mm"] = {
+                model: summarise(rows) for model, rows in against.items()
+            }
         if trials.bound is not None:
             labels = owners(trials.labels)
             seen = observed[:count]
-            content["per_marker"] = {model: errors_per_marker(x, seen, labels) for model, x in test.items()}
+            content["per_marker"] = {
+                model: errors_per_marker(x, seen, labels) for model, x in test.items()
+            }
         if bodies := corners_of(trials.labels):
             content["orientations_deg"] = {
-                model: {name: _mean_angle(x[:count, :, at], points[:count, :, at]) for name, at in bodies.items()}
+                model: {
+                    name: _mean_angle(x[:count, :, at], points[:count, :, at])
+                    for name, at in bodies.items()
+                }
                 for model, x in self.simulated.items()
             }
         if horizons := self._by_horizon(test, observed):
@@ -137,7 +162,9 @@ class ComparedModels:
             sensor, read = motions.sensors[name], torch.from_numpy(readings[rows_of])
             models = dict[str, ErrorSummary]()
             for model, loads in self.loads.items():
-                away = sensor.distances(torch.from_numpy(loads[: len(names), :, number]), read, times).numpy()
+                away = sensor.distances(
+                    torch.from_numpy(loads[: len(names), :, number]), read, times
+                ).numpy()
                 known = [row[at & ~np.isnan(row)] for row, at in zip(away, counts, strict=True)]
                 if any(map(len, known)):
                     models[model] = summarise(row for row in known if len(row))
@@ -151,24 +178,38 @@ class ComparedModels:
             }
         return found
 
-    def _by_horizon(self, test: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, dict[str, ErrorSummary]]:
-        """Returns the errors of the first seconds by duration and model, if frames of all trials count in them."""
+    def _by_horizon(
+        self, test: Mapping[str, FloatArray], observed: FloatArray
+    ) -> dict[str, dict[str, ErrorSummary]]:
+        """Returns the errors of the first seconds by duration and model,
+        if frames of all trials count in them.
+        """
         found = {}
         for seconds in self.horizons:
             frames = slice(round(seconds / self.motions.trials.time_step) + 1)
-            errors = {m: _errors(x[:, frames], observed[:, frames], [0] * len(observed)) for m, x in test.items()}
+            errors = {
+                m: _errors(x[:, frames], observed[:, frames], [0] * len(observed))
+                for m, x in test.items()
+            }
             if all(len(row) for rows in errors.values() for row in rows):
                 found[f"{seconds:g}"] = {model: summarise(rows) for model, rows in errors.items()}
         return found
 
-    def _by_phase(self, test: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, dict[str, ErrorSummary]]:
+    def _by_phase(
+        self, test: Mapping[str, FloatArray], observed: FloatArray
+    ) -> dict[str, dict[str, ErrorSummary]]:
         """Returns the errors by phase of the inputs and model; empty without inputs."""
         names = self.groups["1"]
-        at, seen = phases_of(self.motions.trials, names), np.isfinite(observed[: len(names)]).all(-1).any(-1)
+        at = phases_of(self.motions.trials, names)
+        seen = np.isfinite(observed[: len(names)]).all(-1).any(-1)
         frames = {phase: (at == phase) & seen for phase in PHASES}
         return {
             phase: {
-                model: summarise(marker_errors(x[k, at], observed[k, at]) for k, at in enumerate(rows) if at.any())
+                model: summarise(
+                    marker_errors(x[k, at], observed[k, at])
+                    for k, at in enumerate(rows)
+                    if at.any()
+                )
                 for model, x in test.items()
             }
             for phase, rows in frames.items()
@@ -181,7 +222,10 @@ class ComparedModels:
         content: ErrorTables = {}
         at = {scale: slice(i * count, (i + 1) * count) for i, scale in enumerate(self.groups)}
         ranges = {
-            scale: {m: _range(steps[rows], self.groups[scale], trials.time_step) for m, steps in self.left.items()}
+            scale: {
+                m: _range(steps[rows], self.groups[scale], trials.time_step)
+                for m, steps in self.left.items()
+            }
             for scale, rows in at.items()
         }
         if self.left:
@@ -189,7 +233,9 @@ class ComparedModels:
         if len(self.groups) > 1:
             first = [first_frame(trials, [name]) for name in self.groups["1"]]
             content["scales"] = {
-                scale: {m: summarise(_errors(x[rows], observed[rows], first)) for m, x in models.items()}
+                scale: {
+                    m: summarise(_errors(x[rows], observed[rows], first)) for m, x in models.items()
+                }
                 for scale, rows in at.items()
             }
             if self.left:
@@ -203,7 +249,8 @@ def counted(
     names: Sequence[str],
     first_frames: Mapping[str, Mapping[str, float]],
 ) -> FloatArray:
-    """(R, T, M, 3) observed points of tested trials [m], NaN in frames that were used for training or first values.
+    """(R, T, M, 3) observed points of tested trials [m],
+    NaN in frames that were used for training or first values.
 
     Raises:
         InputError: nothing is left of a trial after the frames from which values were estimated.
@@ -212,8 +259,8 @@ def counted(
     for name, frames in zip(names, used_frames(motions.trials, names, first_frames), strict=True):
         if frames.all():
             raise InputError(
-                f"values of {name!r} are estimated from all of it, so that nothing is left to test: shorten "
-                "release.window."
+                f"values of {name!r} are estimated from all of it, so that nothing is left to "
+                "test: shorten release.window."
             )
     observed[~counting(motions, train, names, first_frames)] = np.nan
     return observed
@@ -225,7 +272,9 @@ def counting(
     names: Sequence[str],
     first_frames: Mapping[str, Mapping[str, float]],
 ) -> BoolArray:
-    """(R, T) whether frames of tested trials count, as nothing was learned or estimated from them."""
+    """(R, T) whether frames of tested trials count,
+    as nothing was learned or estimated from them.
+    """
     counts = ~used_frames(motions.trials, names, first_frames)
     for row, name in enumerate(names):
         if name in train:
@@ -239,11 +288,12 @@ def beyond_training(
     names: Sequence[str],
     first_frames: Mapping[str, Mapping[str, float]],
 ) -> dict[str, dict[str, float]]:
-    """Returns by how much tested trials leave the range of the training trials, over its largest value there.
+    """Returns by how much tested trials leave the range of the training trials,
+    over its largest value there.
 
-    A trial leaves it where one of its inputs, its payload or a coordinate of a displacement is outside of the least and
-    the largest one of the training, or the norm of all inputs is larger. Excesses of up to 5 % of the inputs and loads,
-    and 10 % of the displacements, are left out.
+    A trial leaves it where one of its inputs, its payload or a coordinate of a displacement is
+    outside of the least and the largest one of the training, or the norm of all inputs is larger.
+    Excesses of up to 5 % of the inputs and loads, and 10 % of the displacements, are left out.
 
     Args:
         motions: observed trials.
@@ -263,12 +313,18 @@ def beyond_training(
     frames = moved.shape[1]
     kinds = [("displacements", moved.reshape(len(rows), frames, -1))]
     kinds.append(("loads", np.tile(trials.payload[rows][:, None, None], (1, frames, 1))))
-    kinds += [("inputs", values) for name, values in driving(trials, every).items() if name in trials.inputs]
+    kinds += [
+        ("inputs", values)
+        for name, values in driving(trials, every).items()
+        if name in trials.inputs
+    ]
     found = dict[str, dict[str, float]]()
     for kind, values in kinds:
         learned = values[: len(train), : motions.learned_steps(frames - 1) + 1]
         for name, counts in zip(names, tested, strict=True):
-            excess = _excess(learned.reshape(-1, values.shape[2]), values[every.index(name)][counts])
+            excess = _excess(
+                learned.reshape(-1, values.shape[2]), values[every.index(name)][counts]
+            )
             if excess > _EXCESS[kind]:
                 of_trial = found.setdefault(name, {})
                 of_trial[kind] = max(excess, of_trial.get(kind, 0.0))
@@ -304,7 +360,9 @@ def amplitudes(trials: Trials, names: Sequence[str]) -> dict[str, float]:
 
 
 def _mean_angle(simulated: FloatArray, observed: FloatArray) -> float | None:
-    """Mean over trials of the error of a rigid body's orientation, where seen [degrees]; None if a roll-out diverged.
+    """Mean over trials of the error of a rigid body's orientation, where seen [degrees].
+
+    None if a roll-out diverged.
 
     Args:
         simulated: (R, T, 4, 3) its points [m].

@@ -1,4 +1,6 @@
-"""Roll-outs of a simulator, a simulator with a learned force, or a network alone, over observed motions."""
+"""Roll-outs of a simulator, a simulator with a learned force,
+or a network alone, over observed motions.
+"""
 
 import contextlib
 import math
@@ -22,12 +24,20 @@ from ..stepping.state import State
 from .metrics import marker_errors, summarise
 from .observed_motions import Identified, ObservedMotions
 from .replay import Replay
-from .residuals.correction import CorrectedSimulator, Learned, LearnedPredictor, Predictor, force_frames
+from .residuals.correction import (
+    CorrectedSimulator,
+    Learned,
+    LearnedPredictor,
+    Predictor,
+    force_frames,
+)
 from .start import Start
 
 HELD_OUT: Final = "left-out training"
 _FOLDS: Final = 3  # of the training trials, where validation trials do not suffice
-POSE_STEPS: Final = 200  # after which the roll-out of a network without simulator is taken to be at rest
+POSE_STEPS: Final = (
+    200  # after which the roll-out of a network without simulator is taken to be at rest
+)
 
 
 @checks_types
@@ -46,17 +56,18 @@ def evaluate(
     Args:
         simulator: to evaluate.
         motions: observed states or markers.
-        force: learned force from `fit_force`, or a function of the state and the number of the step that returns forces
-            (B, N, 3) [N] for trials that begin alike; None for the simulator alone.
+        force: learned force from `fit_force`, or a function of the state and the number of the step
+            that returns forces (B, N, 3) [N] for trials that begin alike; None for the simulator
+            alone.
         names: of the R trials; all by default.
         parameters: values in place of the simulator's, such as `Identification.parameters`.
         sensor: name of the force sensor whose error is returned; None for that of the points.
         parts: workers and files of the work; this process and its memory if None.
 
     Returns:
-        (T, R) mean distance of the observed points in the unit of the observation, such as m, or error of a force
-        (`ForceSensor.distances`) [N]; NaN where nothing was seen or parameters were estimated
-        (`Identified.first_frames`), infinite after a simulation diverged.
+        (T, R) mean distance of the observed points in the unit of the observation, such as m, or
+        error of a force (`ForceSensor.distances`) [N]; NaN where nothing was seen or parameters
+        were estimated (`Identified.first_frames`), infinite after a simulation diverged.
 
     Raises:
         InputError: an input that the body does not take.
@@ -65,23 +76,35 @@ def evaluate(
     trials, parts = motions.trials, parts or Parts("evaluate")
     names = trials.chosen(names)
     if sensor is not None and sensor not in motions.sensors:
-        raise InputError(f"there is no force sensor {sensor!r}: there are {listed([*motions.sensors]) or 'none'}.")
+        raise InputError(
+            f"there is no force sensor {sensor!r}: there are "
+            f"{listed([*motions.sensors]) or 'none'}."
+        )
     if sensor is None and isinstance(motions.observe, NoPoints):
-        raise InputError(f"forces alone are observed: name one of the sensors, {listed([*motions.sensors])}.")
+        raise InputError(
+            f"forces alone are observed: name one of the sensors, {listed([*motions.sensors])}."
+        )
     cut_up = rollout_parts(simulator, motions, names, force, parameters, parts.batch)
     parts.run(cut_up)
     order, rows = [name for part in cut_up for name in part.names], trials.rows(names)
     used = torch.from_numpy(used_frames(trials, names, Identified.of(parameters).first_frames))
     array = "observed" if sensor is None else "loads"
-    made = parts.joined(cut_up, array, trials.observed.shape[1])[[order.index(name) for name in names]]
+    made = parts.joined(cut_up, array, trials.observed.shape[1])[
+        [order.index(name) for name in names]
+    ]
     if sensor is not None:
         shown, read = (
-            torch.from_numpy(x) for x in (made[:, :, [*trials.loads].index(sensor)], trials.loads[sensor][rows])
+            torch.from_numpy(x)
+            for x in (made[:, :, [*trials.loads].index(sensor)], trials.loads[sensor][rows])
         )
         away = motions.sensors[sensor].distances(shown, read, torch.from_numpy(trials.times[rows]))
         return np.asarray(torch.where(used, torch.nan, away).T.numpy())
     shown, observed = simulator.tensor(made), simulator.tensor(trials.observed[rows])
-    away = motions.observe.residual(shown.nan_to_num(math.inf), observed).norm(dim=-1).nan_to_num(math.inf)
+    away = (
+        motions.observe.residual(shown.nan_to_num(math.inf), observed)
+        .norm(dim=-1)
+        .nan_to_num(math.inf)
+    )
     seen = torch.isfinite(observed).all(-1) & ~used[..., None].to(away.device)
     return np.asarray(torch.where(seen, away, torch.nan).nanmean(2).T.cpu().numpy())
 
@@ -111,10 +134,16 @@ def rollout_parts(
     parts = list[TrialPart]()
     for number, whole in enumerate(motions.trials.batches(names)):
         steps = math.ceil(motions.trials.seconds(whole) / simulator.time_step)
-        if not motions.trials.moving(whole) and isinstance(force, Learned) and force.replaces_simulator:
+        if (
+            not motions.trials.moving(whole)
+            and isinstance(force, Learned)
+            and force.replaces_simulator
+        ):
             steps = POSE_STEPS
         for first, some in cut(whole, batch):
-            work = partial(roll_out, simulator, motions, some, force, Identified.of(parameters), filmed)
+            work = partial(
+                roll_out, simulator, motions, some, force, Identified.of(parameters), filmed
+            )
             parts.append(TrialPart(f"{label}{number}_{first:03d}", some, steps + 1, work))
     return parts
 
@@ -131,7 +160,8 @@ def roll_out(
     """Rolls out trials that begin in the same way.
 
     Args:
-        simulator: of which a copy is used, so that results do not depend on other parts, and its buffers are let go.
+        simulator: of which a copy is used, so that results do not depend on other parts, and its
+            buffers are let go.
         motions: see `evaluate`.
         names: of the R trials.
         force: see `evaluate`.
@@ -140,14 +170,17 @@ def roll_out(
         report: called after every step.
 
     Returns:
-        ``observed`` (R, T, M, D) points at the frames, NaN where the roll-out diverged; ``sideways`` (R,) estimated
-        displacement of bodies before their release [mm], NaN where it is not estimated; with force sensors, ``loads``
-        (R, T, S, 6) readings [N, N m], NaN where there is none of a model; with a network, ``left`` (R,)
-        steps at which trials left the training range, -1 where they did not; ``film`` (K + 1, N, 3) vertices [m].
+        ``observed`` (R, T, M, D) points at the frames, NaN where the roll-out diverged;
+        ``sideways`` (R,) estimated displacement of bodies before their release [mm], NaN where it
+        is not estimated; with force sensors, ``loads`` (R, T, S, 6) readings [N, N m], NaN where
+        there is none of a model; with a network, ``left`` (R,) steps at which trials left the
+        training range, -1 where they did not; ``film`` (K + 1, N, 3) vertices [m].
     """
     data_driven = isinstance(force, Learned) and force.replaces_simulator
     simulator = replace(simulator, solver=simulator.settings.changed(on_failure="count"))
-    run, points, bodies = TrialRollout(simulator, motions, names, identified, data_driven), [], list[torch.Tensor]()
+    run = TrialRollout(simulator, motions, names, identified, data_driven)
+    points = []
+    bodies = list[torch.Tensor]()
     predictor = run.predictor(force) if isinstance(force, Learned) else force
     loads = list[torch.Tensor]()
     for state in run.roll(predictor):
@@ -155,11 +188,15 @@ def roll_out(
         loads.append(run.loads(state, len(loads)))
         lost = state.lost
         bodies += [
-            torch.where(lost[row], torch.nan, state.q[row]).float() for row, name in enumerate(names) if name == filmed
+            torch.where(lost[row], torch.nan, state.q[row]).float()
+            for row, name in enumerate(names)
+            if name == filmed
         ]
         report()
     shift = run.start.shift
-    sideways = torch.full((len(names),), torch.nan) if shift is None else 1e3 * shift.norm(dim=2).mean(1)
+    sideways = (
+        torch.full((len(names),), torch.nan) if shift is None else 1e3 * shift.norm(dim=2).mean(1)
+    )
     arrays: dict[str, Any] = {"observed": (run.at_frames(points), motions.observe.unit)}
     arrays["sideways"] = (sideways.cpu().numpy(), "mm")
     if motions.sensors:
@@ -209,17 +246,23 @@ class TrialRollout:
             self.steps = POSE_STEPS if data_driven else 0
 
     def predictor(self, learned: Learned, replay: Replay | None = None) -> LearnedPredictor:
-        """Returns the predictor of a network in these trials, or raises InputError for one of another body.
+        """Returns the predictor of a network in these trials,
+        or raises InputError for one of another body.
 
         Args:
             learned: the network.
             replay: of the trials under other inputs; None: `replay`.
         """
         if (given := len(learned.network.rest)) != (wanted := len(self._simulator.rest_positions)):
-            raise InputError(f"a force on {given} vertices was learned, but the body has {wanted}: learn one for it.")
+            raise InputError(
+                f"a force on {given} vertices was learned, "
+                f"but the body has {wanted}: learn one for it."
+            )
         frames = None if self._data_driven else force_frames(self._simulator, learned.force_frame)
         base = self._motions.base(self.replay.trials.names, self._simulator)
-        conditions = self._motions.conditions(replay or self.replay, self._values, self._data_driven)
+        conditions = self._motions.conditions(
+            replay or self.replay, self._values, self._data_driven
+        )
         return LearnedPredictor(learned.network, conditions, learned.range_, frames, base)
 
     @torch.no_grad()
@@ -231,7 +274,9 @@ class TrialRollout:
         """
         force: Any = predictor if self.replay.is_static and not self._data_driven else None
         if force is not None:
-            return self.replay.initial_state(self.start, self._constants, self._resting, force=force)
+            return self.replay.initial_state(
+                self.start, self._constants, self._resting, force=force
+            )
         if self._first is None:
             self._first = self.replay.initial_state(self.start, self._constants, self._resting)
         return self._first
@@ -257,7 +302,8 @@ class TrialRollout:
     def loads(self, state: State, number: int) -> torch.Tensor:
         """(R, S, 6) readings in a state of `roll` by its number [N, N m].
 
-        They are NaN in an initial state that no equilibrium led to, and infinite where the simulation has diverged.
+        They are NaN in an initial state that no equilibrium led to, and infinite where the
+        simulation has diverged.
         """
         before, self._before, sensors = self._before, state, len(self.replay.trials.sensors)
         resting = number == 0 and self.start.at_rest
@@ -275,14 +321,17 @@ class TrialRollout:
         return torch.where(state.lost[:, None, None], torch.nan, self.replay.observe(state.q))
 
     def at_frames(self, points: Sequence[torch.Tensor]) -> FloatArray:
-        """(R, T, M, D) observed points at the frames of the trials, from those of all steps (R, M, D)."""
+        """(R, T, M, D) observed points at frames of trials, from those of all steps (R, M, D)."""
         return np.asarray(self.replay.at_frames(self._stacked(points), self.start).cpu().numpy())
 
     def loads_at_frames(self, loads: Sequence[torch.Tensor]) -> FloatArray:
-        """(R, T, S, 6) readings at the frames of the trials [N, N m], from those of all steps (R, S, 6)."""
+        """(R, T, S, 6) readings at frames of trials [N, N m], from those of all steps (R, S, 6)."""
         series = self._stacked(loads)
-        lost = self.replay.loads_at_frames(series.isinf().to(series), self.start) > 0.5  # of the steps around a frame
-        read = self.replay.loads_at_frames(torch.where(series.isinf(), torch.nan, series), self.start)
+        # Of the steps around a frame.
+        lost = self.replay.loads_at_frames(series.isinf().to(series), self.start) > 0.5
+        read = self.replay.loads_at_frames(
+            torch.where(series.isinf(), torch.nan, series), self.start
+        )
         return np.asarray(torch.where(lost, torch.inf, read).cpu().numpy())
 
     def _stacked(self, steps: Sequence[torch.Tensor]) -> torch.Tensor:
@@ -290,7 +339,9 @@ class TrialRollout:
         return torch.stack([*steps[-1:]] if self.replay.is_static else [*steps], 1)
 
     def errors(self, learned: Learned | None) -> list[FloatArray]:
-        """Mean marker distances [mm] of each trial at its training frames; NaN where the roll-out diverged.
+        """Mean marker distances [mm] of each trial at its training frames.
+
+        NaN where the roll-out diverged.
 
         Args:
             learned: network; None for the simulator alone.
@@ -301,7 +352,9 @@ class TrialRollout:
             steps = min(steps, motions.learned_steps(steps))
         series: list[torch.Tensor] = []
         with contextlib.suppress(ConvergenceError):
-            for state in islice(self.roll(None if learned is None else self.predictor(learned)), steps + 1):
+            for state in islice(
+                self.roll(None if learned is None else self.predictor(learned)), steps + 1
+            ):
                 if series and bool(state.lost.all()):
                     series = []
                     break
@@ -309,7 +362,9 @@ class TrialRollout:
         if not series:
             return [np.full(1, np.nan) for _ in observed]
         first = first_frame(motions.trials, self.replay.trials.names)
-        pairs = zip(self.at_frames(series)[:, first:], observed[:, first:].cpu().numpy(), strict=True)
+        pairs = zip(
+            self.at_frames(series)[:, first:], observed[:, first:].cpu().numpy(), strict=True
+        )
         return [marker_errors(x[: len(y)], y) for x, y in pairs]
 
 
@@ -318,15 +373,22 @@ def first_frame(trials: Trials, names: Sequence[str]) -> int:
     return int(trials.begin_of(names[0]) == GIVEN)
 
 
-def used_frames(trials: Trials, names: Sequence[str], first_frames: Mapping[str, Mapping[str, float]]) -> BoolArray:
-    """(R, T) whether values were estimated from a frame of some trials, see `Identified.first_frames`."""
+def used_frames(
+    trials: Trials, names: Sequence[str], first_frames: Mapping[str, Mapping[str, float]]
+) -> BoolArray:
+    """(R, T) whether values were estimated from a frame of some trials, see
+    `Identified.first_frames`.
+    """
     seconds = {name: until for shown in first_frames.values() for name, until in shown.items()}
     last = np.array([seconds.get(name, -math.inf) for name in names])
     return np.asarray(trials.times[trials.rows(names)] <= last[:, None] + 1e-9)
 
 
-def left_out_in_turn(trials: Trials, names: Sequence[str], validation: Sequence[str] = ()) -> list[tuple[str, ...]]:
-    """Divides the training trials that begin alike among the folds of a test where validation trials do not suffice.
+def left_out_in_turn(
+    trials: Trials, names: Sequence[str], validation: Sequence[str] = ()
+) -> list[tuple[str, ...]]:
+    """Divides the training trials that begin alike among the folds of a test
+    where validation trials do not suffice.
 
     A single static pose does not, as its error has no spread.
 
@@ -336,14 +398,16 @@ def left_out_in_turn(trials: Trials, names: Sequence[str], validation: Sequence[
         validation: names of the validation trials.
 
     Returns:
-        Names that are left out of a fit together; nothing if the validation trials suffice, or if each training trial
-        begins in its own way.
+        Names that are left out of a fit together; nothing if the validation trials suffice, or if
+        each training trial begins in its own way.
     """
     if len(validation) > 1 or any(trials.begin_of(name) != STATIC for name in validation):
         return []
     alike = [batch for batch in trials.batches(names) if len(batch) > 1]
     count = min(max(map(len, alike), default=0), _FOLDS)
-    return [tuple(name for batch in alike for name in batch[number::count]) for number in range(count)]
+    return [
+        tuple(name for batch in alike for name in batch[number::count]) for number in range(count)
+    ]
 
 
 class HeldOutRollouts:
@@ -366,7 +430,9 @@ class HeldOutRollouts:
         data_driven: bool = False,
     ) -> None:
         self.batches = motions.trials.batches(names)
-        self._of = partial(TrialRollout, simulator, motions, identified=identified, data_driven=data_driven)
+        self._of = partial(
+            TrialRollout, simulator, motions, identified=identified, data_driven=data_driven
+        )
 
     @cached_property
     def _runs(self) -> list[TrialRollout]:

@@ -1,20 +1,23 @@
 """Prediction intervals of roll-outs: how far observed markers will be from the predicted ones.
 
-Posteriors of parameters and ensembles of networks do not contain the physics that a model lacks, which is most of its
-error. So intervals are calibrated on the model's errors in trials that it was not trained on (split conformal
-prediction: Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005; scaled as by Lei et al. 2018).
-For trials of the same distribution they have the stated coverage, whatever the model.
+Posteriors of parameters and ensembles of networks do not contain the physics that a model lacks,
+which is most of its error. So intervals are calibrated on the model's errors in trials that it was
+not trained on (split conformal prediction: Vovk, Gammerman and Shafer, Algorithmic Learning in a
+Random World, 2005; scaled as by Lei et al. 2018). For trials of the same distribution they have the
+stated coverage, whatever the model.
 
-The half-width of a marker's coordinates is a quantile times a scale, the deviation of a normal distribution whose
-variance has a constant part and parts that grow with the square of the marker's displacement: one just after a change
-of the inputs, one soon after it, and one long after it; and, if it is known, the variance due to the posterior of the
-parameters, which grows outside of the training. The sizes of the parts are those of the largest likelihood.
+The half-width of a marker's coordinates is a quantile times a scale, the deviation of a normal
+distribution whose variance has a constant part and parts that grow with the square of the marker's
+displacement: one just after a change of the inputs, one soon after it, and one long after it; and,
+if it is known, the variance due to the posterior of the parameters, which grows outside of the
+training. The sizes of the parts are those of the largest likelihood.
 
-Beyond the largest displacement of the training and calibration, half-widths also grow with the excess, as the errors of
-the training trial with the largest displacement did, less what the half-widths contain, for a simulator whose
-parameters are identified without it, to first order. As this is a single trial, the growth is Student's quantile with
-one degree of freedom times the root mean square. A learned force or actuator has the growth of the simulator below, as
-it was trained on the trial; other models have none.
+Beyond the largest displacement of the training and calibration, half-widths also grow with the
+excess, as the errors of the training trial with the largest displacement did, less what the
+half-widths contain, for a simulator whose parameters are identified without it, to first order. As
+this is a single trial, the growth is Student's quantile with one degree of freedom times the root
+mean square. A learned force or actuator has the growth of the simulator below, as it was trained on
+the trial; other models have none.
 """
 
 import math
@@ -34,12 +37,19 @@ from ..data.trials import Trials
 from ..io.arrays import BoolArray, FloatArray
 
 LEVEL: Final = 0.9
-TIMES: Final = (0.1, 0.5)  # s after a change of the inputs: between just after, soon after and long after it
+# s after a change of the inputs: between just after, soon after and long after it
+TIMES: Final = (0.1, 0.5)
 _QUARTERS: Final = 4  # parts of a single trial
-_LEVELS: Final = 11  # number of quantiles that are tried, from the wanted level to the largest value
+_LEVELS: Final = (
+    11  # number of quantiles that are tried, from the wanted level to the largest value
+)
 _LEAST: Final = 1e-3  # of the mean variance: part that is always there
-_PENALTY: Final = 1e-3  # of the negative log-likelihood, for each part as large as the mean variance
-_LEAST_EXCESS: Final = 3.0  # beyond the training, over the deviation of the errors within: less shows no growth
+_PENALTY: Final = (
+    1e-3  # of the negative log-likelihood, for each part as large as the mean variance
+)
+_LEAST_EXCESS: Final = (
+    3.0  # beyond the training, over the deviation of the errors within: less shows no growth
+)
 _SMALLEST: Final = -12.0  # logarithm of a part over the mean variance
 
 
@@ -62,7 +72,9 @@ class ModelIntervals(TypedDict, total=False):
     coverage: float  # share of the coordinates inside their interval
     half_width_mm: float  # mean
     by_trial: dict[str, float]  # coverage
-    without_spread: PlainIntervals  # for robots, which do not know the variance due to the parameters
+    without_spread: (
+        PlainIntervals  # for robots, which do not know the variance due to the parameters
+    )
 
 
 class IntervalTable(TypedDict):
@@ -81,7 +93,8 @@ class Predicted:
         simulated: (T, M, 3) [m].
         observed: (T, M, 3) [m], NaN where a marker was not seen.
         since: (T,) since the last change of the inputs [s]; infinite for a pose.
-        spread: (T, M) variance due to the posterior of the parameters [m^2]; None if it is not known.
+        spread: (T, M) variance due to the posterior of the parameters [m^2]; None if it is not
+            known.
     """
 
     simulated: FloatArray
@@ -98,7 +111,9 @@ class Predicted:
         """The four quarters of the frames; the whole of fewer frames."""
         count = _QUARTERS if len(self.since) >= _QUARTERS else 1
         spreads = [None] * count if self.spread is None else np.array_split(self.spread, count)
-        series = (np.array_split(values, count) for values in (self.simulated, self.observed, self.since))
+        series = (
+            np.array_split(values, count) for values in (self.simulated, self.observed, self.since)
+        )
         return [Predicted(*parts) for parts in zip(*series, spreads, strict=True)]
 
     @property
@@ -114,8 +129,9 @@ class Intervals:
 
     Attributes:
         factor: (M,) half-width over the scale.
-        variance: constant part of the squared scale [m^2]; its parts over the squared displacement: just after, soon
-            after and long after a change of the inputs; and its part over the variance due to the parameters.
+        variance: constant part of the squared scale [m^2]; its parts over the squared displacement:
+            just after, soon after and long after a change of the inputs; and its part over the
+            variance due to the parameters.
         reach: largest displacement of training and calibration [m].
         growth: of the half-width per displacement beyond it.
     """
@@ -129,12 +145,15 @@ class Intervals:
     def calibrated(
         cls, predicted: Mapping[str, Predicted], rest: FloatArray, level: float = LEVEL
     ) -> "Intervals | None":
-        """Calibrates intervals on trials that the model was not trained on; None if a roll-out diverged.
+        """Calibrates intervals on trials that the model was not trained on.
 
-        The quantile is the lowest for which intervals from all trials but one have the wanted mean coverage on the
-        trial left out; the largest deviation if there is no such quantile, or only one pose. The quarters of a single
-        motion count as trials. All trials have equal weight.
-        Markers that are seen in no trial get the largest quantile of the others, without a guarantee.
+        None if a roll-out diverged.
+
+        The quantile is the lowest for which intervals from all trials but one have the wanted mean
+        coverage on the trial left out; the largest deviation if there is no such quantile, or only
+        one pose. The quarters of a single motion count as trials. All trials have equal weight.
+        Markers that are seen in no trial get the largest quantile of the others, without a
+        guarantee.
 
         Args:
             predicted: trials that the model predicted, by name.
@@ -142,17 +161,26 @@ class Intervals:
             level: wanted coverage, a share of the coordinates.
         """
         trials = [trial for trial in predicted.values() if trial.seen.any()]
-        if not trials or not all(np.isfinite(trial.simulated[trial.seen]).all() for trial in trials):
+        if not trials or not all(
+            np.isfinite(trial.simulated[trial.seen]).all() for trial in trials
+        ):
             return None
         if len(trials) == 1:
             trials = [quarter for quarter in trials[0].quarters() if quarter.seen.any()]
-        parts = [_parts(np.linalg.norm(t.simulated - rest, axis=-1), t.since, t.spread) for t in trials]
+        parts = [
+            _parts(np.linalg.norm(t.simulated - rest, axis=-1), t.since, t.spread) for t in trials
+        ]
         errors = [trial.errors for trial in trials]
 
         def scaled(kept: Sequence[int]) -> tuple[FloatArray, list[FloatArray]]:
-            """Sizes of the parts of the variance from some trials, and the errors of all over that scale."""
+            """Sizes of the parts of the variance from some trials,
+            and the errors of all over that scale.
+            """
             sizes = _variance([parts[k] for k in kept], [errors[k] for k in kept])
-            return sizes, [error / np.sqrt(part @ sizes)[..., None] for part, error in zip(parts, errors, strict=True)]
+            return sizes, [
+                error / np.sqrt(part @ sizes)[..., None]
+                for part, error in zip(parts, errors, strict=True)
+            ]
 
         every, left_out = [*range(len(trials))], []
         for out in every if len(trials) > 1 else ():
@@ -165,14 +193,19 @@ class Intervals:
         return cls(tuple(factor.tolist()), tuple(variance.tolist()))
 
     def half_widths(
-        self, simulated: FloatArray, rest: FloatArray, since: ArrayLike | None = None, spread: FloatArray | None = None
+        self,
+        simulated: FloatArray,
+        rest: FloatArray,
+        since: ArrayLike | None = None,
+        spread: FloatArray | None = None,
     ) -> FloatArray:
         """Half-widths (..., M) for the coordinates of simulated markers.
 
         Args:
             simulated: (..., M, 3) [m].
             rest: (M, 3) [m].
-            since: (...,) since the last change of the inputs [s]; None for the time at which intervals are widest.
+            since: (...,) since the last change of the inputs [s]; None for the time at which
+                intervals are widest.
             spread: (..., M) variance due to the posterior of the parameters [m^2]; None for none.
         """
         moved, variance = np.linalg.norm(simulated - rest, axis=-1), np.array(self.variance)
@@ -185,10 +218,12 @@ class Intervals:
     def growing(
         self, beyond: Predicted, before: float, reach: float, rest: FloatArray, level: float = LEVEL
     ) -> "Intervals":
-        """Returns intervals that grow beyond their reach as the errors of a trial did, if its excess is large enough.
+        """Returns intervals that grow beyond their reach as the errors of a trial did,
+        if its excess is large enough.
 
         Args:
-            beyond: the training trial with the largest displacement, predicted by a model identified without it.
+            beyond: the training trial with the largest displacement, predicted by a model
+                identified without it.
             before: largest displacement of that model's training [m].
             reach: largest displacement of training and calibration [m].
             rest: (M, 3) [m].
@@ -197,12 +232,19 @@ class Intervals:
         moved = np.linalg.norm(beyond.simulated - rest, axis=-1)
         excess = np.where(beyond.seen, np.maximum(moved - before, 0.0), 0.0)
         at, total = excess > 0.0, float(np.square(excess).sum())
-        widths = replace(self, growth=0.0).half_widths(beyond.simulated, rest, beyond.since, beyond.spread)
-        within = float(np.square(widths[at] / norm.ppf(0.5 + 0.5 * level)).sum())  # variance of normal errors
+        widths = replace(self, growth=0.0).half_widths(
+            beyond.simulated, rest, beyond.since, beyond.spread
+        )
+        # Variance of normal errors.
+        within = float(np.square(widths[at] / norm.ppf(0.5 + 0.5 * level)).sum())
         errors = max(float(np.square(beyond.errors[at]).mean(-1).sum()) - within, 0.0)
         if total <= _LEAST_EXCESS**2 * within:
             return replace(self, reach=reach)
-        return replace(self, reach=reach, growth=math.sqrt(errors / total) * float(student.ppf(0.5 + 0.5 * level, 1)))
+        return replace(
+            self,
+            reach=reach,
+            growth=math.sqrt(errors / total) * float(student.ppf(0.5 + 0.5 * level, 1)),
+        )
 
     def plain(self) -> PlainIntervals:
         """Returns the intervals as JSON data."""
@@ -229,8 +271,8 @@ class Intervals:
             rest: (M, 3) [m].
 
         Returns:
-            (K,) share of the coordinates inside their interval, and (K,) half-widths [m], of the K markers and frames
-            that were seen.
+            (K,) share of the coordinates inside their interval, and (K,) half-widths [m], of the K
+            markers and frames that were seen.
         """
         seen, width = trial.seen, self.half_widths(trial.simulated, rest, trial.since, trial.spread)
         with np.errstate(invalid="ignore"):
@@ -239,7 +281,10 @@ class Intervals:
 
 
 def coverage(covered: Mapping[str, tuple[FloatArray, FloatArray]]) -> ModelIntervals:
-    """Summarises trials with equal weight, from `Intervals.covered`; those without a seen marker are left out."""
+    """Summarises trials with equal weight, from `Intervals.covered`.
+
+    Those without a seen marker are left out.
+    """
     seen = {name: (float(x.mean()), float(w.mean())) for name, (x, w) in covered.items() if len(x)}
     inside, widths = np.mean([*seen.values()], axis=0)
     by_trial = {name: share for name, (share, _) in seen.items()}
@@ -256,7 +301,16 @@ def _parts(moved: FloatArray, since: FloatArray, spread: FloatArray | None) -> F
     """
     just, soon = (np.exp(-since / time)[..., None] for time in TIMES)
     squares, known = moved**2, np.zeros_like(moved) if spread is None else spread
-    return np.stack([np.ones_like(moved), just * squares, (soon - just) * squares, (1.0 - soon) * squares, known], -1)
+    return np.stack(
+        [
+            np.ones_like(moved),
+            just * squares,
+            (soon - just) * squares,
+            (1.0 - soon) * squares,
+            known,
+        ],
+        -1,
+    )
 
 
 def _variance(parts: Sequence[FloatArray], errors: Sequence[FloatArray]) -> FloatArray:
@@ -270,11 +324,17 @@ def _variance(parts: Sequence[FloatArray], errors: Sequence[FloatArray]) -> Floa
     """
     seen = [np.isfinite(error).all(-1) for error in errors]
     rows = np.concatenate([part[visible] for part, visible in zip(parts, seen, strict=True)])
-    squares = np.concatenate([np.square(e[visible]).mean(-1) for e, visible in zip(errors, seen, strict=True)])
-    weights = np.concatenate([np.full(count, 1.0 / (count * len(seen))) for count in map(np.count_nonzero, seen)])
+    squares = np.concatenate(
+        [np.square(e[visible]).mean(-1) for e, visible in zip(errors, seen, strict=True)]
+    )
+    weights = np.concatenate(
+        [np.full(count, 1.0 / (count * len(seen))) for count in map(np.count_nonzero, seen)]
+    )
     mean, sizes = max(float(weights @ squares), np.finfo(float).tiny), weights @ rows
     used = np.flatnonzero(sizes > 0.0)
-    columns, relative, least = rows[:, used] / sizes[used], squares / mean, rows[:, -1] / mean + _LEAST
+    columns = rows[:, used] / sizes[used]
+    relative = squares / mean
+    least = rows[:, -1] / mean + _LEAST
 
     def loss(logarithms: FloatArray) -> tuple[float, FloatArray]:
         variances = np.exp(logarithms)
@@ -296,7 +356,8 @@ def _level(left_out: Sequence[tuple[FloatArray, Sequence[FloatArray]]], level: f
     """The lowest level of quantiles that cover trials left out as wanted; one if there is none.
 
     Args:
-        left_out: scaled errors (T, M, 3) of each trial, and those of all others with the same scale.
+        left_out: scaled errors (T, M, 3) of each trial, and those of all others with the same
+            scale.
         level: wanted mean coverage.
     """
 
@@ -310,13 +371,18 @@ def _level(left_out: Sequence[tuple[FloatArray, Sequence[FloatArray]]], level: f
 
 
 def _quantiles(scores: Sequence[FloatArray], level: float) -> FloatArray:
-    """(M,) quantiles of the finite values (T, M, 3), all trials with equal weight; infinite where there are none."""
+    """(M,) quantiles of the finite values (T, M, 3), all trials with equal weight.
+
+    Infinite where there are none.
+    """
     quantiles = np.full(scores[0].shape[1], np.inf)
     for m in range(len(quantiles)):
         used = [trial[np.isfinite(trial)] for trial in (score[:, m].ravel() for score in scores)]
         used = [trial for trial in used if len(trial)]
         if used:
-            weights = np.concatenate([np.full(len(trial), 1.0 / (len(trial) * len(used))) for trial in used])
+            weights = np.concatenate(
+                [np.full(len(trial), 1.0 / (len(trial) * len(used))) for trial in used]
+            )
             values = np.concatenate(used)
             order = np.argsort(values)
             reached = int(np.searchsorted(np.cumsum(weights[order]), level - 1e-9))
@@ -325,9 +391,14 @@ def _quantiles(scores: Sequence[FloatArray], level: float) -> FloatArray:
 
 
 def intervals_of_each_other(
-    trials: Trials, names: Sequence[str], simulated: Sequence[FloatArray], spreads: Sequence[FloatArray] | None
+    trials: Trials,
+    names: Sequence[str],
+    simulated: Sequence[FloatArray],
+    spreads: Sequence[FloatArray] | None,
 ) -> ModelIntervals | None:
-    """Coverage of intervals of which each trial's are calibrated on the others; None if some cannot be calibrated.
+    """Coverage of intervals of which each trial's are calibrated on the others.
+
+    None if some cannot be calibrated.
 
     Args:
         trials: with those of the names.
@@ -335,10 +406,14 @@ def intervals_of_each_other(
         simulated: (T, M, 3) of each trial, by models that have not learned from it [m].
         spreads: (T, M) variances due to the parameters [m^2]; None if they are not known.
     """
-    predicted = predicted_trials(trials, names, simulated, trials.observed[trials.rows(names)], spreads)
+    predicted = predicted_trials(
+        trials, names, simulated, trials.observed[trials.rows(names)], spreads
+    )
     covered, rest = dict[str, tuple[FloatArray, FloatArray]](), rest_places(trials)
     for out, trial in predicted.items():
-        intervals = Intervals.calibrated({name: other for name, other in predicted.items() if name != out}, rest)
+        intervals = Intervals.calibrated(
+            {name: other for name, other in predicted.items() if name != out}, rest
+        )
         if intervals is None:
             return None
         covered[out] = intervals.covered(trial, rest)
@@ -352,7 +427,8 @@ def half_widths_of(
     simulated: Mapping[str, FloatArray],
     spreads: Mapping[str, FloatArray],
 ) -> dict[str, FloatArray]:
-    """Half-widths (R, T, M) of the intervals of markers and rigid bodies [m], by model that has intervals.
+    """Half-widths (R, T, M) of the intervals of markers and rigid bodies [m],
+    by model that has intervals.
 
     Args:
         trials: with those of the names.
@@ -365,7 +441,10 @@ def half_widths_of(
     since = since_change(trials, names)
     return {
         model: of_model.half_widths(
-            as_markers(simulated[model], trials.labels), rest_places(trials), since, spreads.get(model)
+            as_markers(simulated[model], trials.labels),
+            rest_places(trials),
+            since,
+            spreads.get(model),
         )
         for model, of_model in known.items()
         if of_model is not None and model in simulated

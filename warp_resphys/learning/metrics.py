@@ -12,11 +12,14 @@ from scipy.special import ndtr, stdtrit
 
 from ..io.errors import InputError
 
-_DRAWS, _TAIL = 10_000, 0.05  # of the bootstrap: samples, and probability outside of its interval at either end
+# Of the bootstrap: samples, and probability outside of its interval at either end.
+_DRAWS, _TAIL = 10_000, 0.05
 
 
 class PublishedError(NamedTuple):
-    """A published roll-out error [mm]: mean and standard deviation over the authors' test trajectories."""
+    """A published roll-out error [mm]: mean and standard deviation
+    over the authors' test trajectories.
+    """
 
     mean: float
     std: float
@@ -25,7 +28,8 @@ class PublishedError(NamedTuple):
 class ErrorSummary(TypedDict):
     """One model's roll-out error [mm] on one split, ready for `metrics.json`.
 
-    `mean` and `std` are None when a roll-out diverged: a mean over the survivors would flatter the model.
+    `mean` and `std` are None when a roll-out diverged: a mean over the survivors would flatter the
+    model.
     """
 
     mean: float | None
@@ -43,7 +47,9 @@ class TrialErrors(TypedDict):
 
 
 class Gain(NamedTuple):
-    """Relative reduction of the mean error by one model compared with another, on the same trials."""
+    """Relative reduction of the mean error by one model compared
+    with another, on the same trials.
+    """
 
     share: float  # of the other model's error; negative for an increase
     lower: float  # lower end of the 90 % interval over resampled trials
@@ -54,8 +60,9 @@ class Gain(NamedTuple):
 def paired_gain(before: Sequence[float], after: Sequence[float]) -> Gain:
     """Returns the gain of a model and its interval from a paired bootstrap over trials.
 
-    Percentiles are expanded for small samples as with Student's t (Hesterberg, The American Statistician 69 (2015)
-    371): with two or three trials, the interval reaches from the worst to the best.
+    Percentiles are expanded for small samples as with Student's t (Hesterberg, The American
+    Statistician 69 (2015) 371): with two or three trials, the interval reaches from the worst to
+    the best.
 
     Args:
         before: error of each trial with the other model, positive.
@@ -69,23 +76,32 @@ def paired_gain(before: Sequence[float], after: Sequence[float]) -> Gain:
 
 
 def mean_interval(errors: Sequence[float]) -> tuple[float, float]:
-    """Returns the 90 % interval of a model's mean error over resampled trials, see `paired_gain`."""
+    """Returns the 90 % interval of a model's mean error
+    over resampled trials, see `paired_gain`.
+    """
     drawn, tail = _resampled(np.array([errors], dtype=np.float64))
     lower, upper = np.quantile(drawn[0], [tail, 1.0 - tail])
     return float(lower), float(upper)
 
 
 def _resampled(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Means (P, draws) of resampled columns of (P, R), and the probability outside of an interval at either end."""
+    """Means (P, draws) of resampled columns of (P, R),
+    and the probability outside of an interval at either end.
+    """
     count = values.shape[1]
     rows = np.random.default_rng(0).integers(count, size=(_DRAWS, count))
-    tail = float(ndtr(math.sqrt(count / (count - 1)) * stdtrit(count - 1, _TAIL))) if count > 1 else 0.5
+    tail = (
+        float(ndtr(math.sqrt(count / (count - 1)) * stdtrit(count - 1, _TAIL)))
+        if count > 1
+        else 0.5
+    )
     return values[:, rows].mean(axis=2), tail
 
 
-# J. Gao, M. Y. Michelis, A. Spielberg, R. K. Katzschmann, "Sim-to-Real of Soft Robots with Learned Residual
-# Physics", IEEE Robotics and Automation Letters, 2024: the tables of sim-to-sim results (beam_oscillation,
-# beam_twist), the sim-to-real results (beam_real, sopra) and the extrapolation to 10 s after training on 5 s.
+# J. Gao, M. Y. Michelis, A. Spielberg, R. K. Katzschmann, "Sim-to-Real of Soft Robots with Learned
+# Residual Physics", IEEE Robotics and Automation Letters, 2024: the tables of sim-to-sim results
+# (beam_oscillation, beam_twist), the sim-to-real results (beam_real, sopra) and the extrapolation
+# to 10 s after training on 5 s.
 PUBLISHED_MM: Final[Mapping[str, Mapping[str, PublishedError]]] = {
     "beam_oscillation": {
         "simulation": PublishedError(4.488, 1.468),
@@ -128,7 +144,9 @@ PUBLISHED_WINDOWS_MM: Final[Mapping[str, Mapping[str, Mapping[str, PublishedErro
 }
 
 
-def mean_distance(simulated: NDArray[np.float64], observed: NDArray[np.float64]) -> NDArray[np.float64]:
+def mean_distance(
+    simulated: NDArray[np.float64], observed: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Returns the mean distance of the seen markers or vertices (the paper's eq. 4 and 7).
 
     Args:
@@ -145,7 +163,9 @@ def mean_distance(simulated: NDArray[np.float64], observed: NDArray[np.float64])
         return np.where(seen.any(-1), distance.sum(-1) / np.maximum(seen.sum(-1), 1), np.nan)
 
 
-def marker_errors(simulated: NDArray[np.float64], observed: NDArray[np.float64]) -> NDArray[np.float64]:
+def marker_errors(
+    simulated: NDArray[np.float64], observed: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Returns `mean_distance` [mm] of the frames (T, M, 3) in which a marker was seen, (T',)."""
     errors = mean_distance(simulated, observed)
     return errors[~np.isnan(errors)]
@@ -154,7 +174,9 @@ def marker_errors(simulated: NDArray[np.float64], observed: NDArray[np.float64])
 def errors_per_marker(
     simulated: NDArray[np.float64], observed: NDArray[np.float64], labels: Sequence[str]
 ) -> dict[str, float | None]:
-    """Returns the mean over trials of the error of every marker that was seen [mm]; None where a roll-out diverged.
+    """Returns the mean over trials of the error of every marker that was seen [mm].
+
+    None where a roll-out diverged.
 
     Args:
         simulated: (R, T, M, 3) [m], NaN where a roll-out diverged.
@@ -163,17 +185,21 @@ def errors_per_marker(
     """
     means: dict[str, float | None] = {}
     for m, label in enumerate(labels):
-        errors = [marker_errors(x[:, m : m + 1], y[:, m : m + 1]) for x, y in zip(simulated, observed, strict=True)]
+        errors = [
+            marker_errors(x[:, m : m + 1], y[:, m : m + 1])
+            for x, y in zip(simulated, observed, strict=True)
+        ]
         if of_trials := [of_trial.mean() for of_trial in errors if len(of_trial)]:
             means[label] = _finite_mean(np.array(of_trials))
     return means
 
 
 def summarise(errors: Iterable[NDArray[np.float64]]) -> ErrorSummary:
-    """Returns the mean error over trajectories of that over steps and vertices (E_q of the paper), and its deviation.
+    """Returns the mean error over trajectories of that over steps
+    and vertices (E_q of the paper), and its deviation.
 
-    Every trajectory counts alike, whatever its length. The deviation is that of the mean over the vertices, over
-    trajectories and steps.
+    Every trajectory counts alike, whatever its length. The deviation is that of the mean over the
+    vertices, over trajectories and steps.
 
     Args:
         errors: One array (T,) for each trajectory, from `marker_errors` [mm]; T may differ.
@@ -183,7 +209,9 @@ def summarise(errors: Iterable[NDArray[np.float64]]) -> ErrorSummary:
     """
     rows = [np.asarray(row, dtype=np.float64) for row in errors]
     if not rows or any(row.size == 0 for row in rows):
-        raise InputError("no roll-out error to summarise: the test split needs a trajectory of at least one step")
+        raise InputError(
+            "no roll-out error to summarise: the test split needs a trajectory of at least one step"
+        )
     diverged = sum(not np.isfinite(row).all() for row in rows)
     pooled = np.concatenate(rows)  # (sum of T,) [mm]
     return {
@@ -197,7 +225,7 @@ def summarise(errors: Iterable[NDArray[np.float64]]) -> ErrorSummary:
 def summarise_trajectories(
     names: Sequence[str], errors: Mapping[str, Iterable[NDArray[np.float64]]]
 ) -> list[TrialErrors]:
-    """Returns `per_trajectory` of `metrics.json`: the mean error of every model on every trajectory.
+    """Returns `per_trajectory` of `metrics.json`: the mean error of each model on every trajectory.
 
     Args:
         names: R names of the trajectories.
@@ -209,12 +237,17 @@ def summarise_trajectories(
     means = {model: [_finite_mean(row) for row in rows] for model, rows in errors.items()}
     for model, rows in means.items():
         if len(rows) != len(names):
-            raise InputError(f"{model} has {len(rows)} roll-outs for {len(names)} test trajectories")
-    return [{"name": name, "errors_mm": {m: rows[i] for m, rows in means.items()}} for i, name in enumerate(names)]
+            raise InputError(
+                f"{model} has {len(rows)} roll-outs for {len(names)} test trajectories"
+            )
+    return [
+        {"name": name, "errors_mm": {m: rows[i] for m, rows in means.items()}}
+        for i, name in enumerate(names)
+    ]
 
 
 def summarise_folds(folds: Sequence[Mapping[str, ErrorSummary]]) -> dict[str, ErrorSummary]:
-    """Returns the errors of a cross-validation: mean over the trials, deviation of the folds' means.
+    """Returns the errors of a cross-validation: mean over trials, deviation of the folds' means.
 
     The models are those of all folds: a law is used in some folds alone.
     """
@@ -223,15 +256,20 @@ def summarise_folds(folds: Sequence[Mapping[str, ErrorSummary]]) -> dict[str, Er
 
 
 def published_errors(name: str) -> Mapping[str, PublishedError]:
-    """Returns the published errors of the experiment with the longest name that starts `name`; empty without one."""
+    """Returns the published errors of the experiment with the longest name that starts `name`.
+
+    Empty without one.
+    """
     experiments = [experiment for experiment in PUBLISHED_MM if name.startswith(experiment)]
     return PUBLISHED_MM[max(experiments, key=len)] if experiments else {}
 
 
 def median_filter(values: ArrayLike, time_step: float, window: float = 1.0) -> NDArray[np.float64]:
-    """Returns the running median over a centred time window, as in the published figures of the arm.
+    """Returns the running median over a centred time window,
+    as in the published figures of the arm.
 
-    The window is cut off at both ends of the series. NaN is ignored, unless the whole window is NaN.
+    The window is cut off at both ends of the series. NaN is ignored, unless the whole window is
+    NaN.
 
     Args:
         values: (..., T) at equal steps.
@@ -242,11 +280,15 @@ def median_filter(values: ArrayLike, time_step: float, window: float = 1.0) -> N
         InputError: The step or the window is not positive.
     """
     if not (time_step > 0.0 and window > 0.0):
-        raise InputError(f"a median filter of {window} s at steps of {time_step} s: both must be positive")
+        raise InputError(
+            f"a median filter of {window} s at steps of {time_step} s: both must be positive"
+        )
     rows = np.asarray(values, dtype=np.float64)
     half = int(0.5 * window / time_step + 1e-9)
     blank = np.full((*rows.shape[:-1], half), np.nan)
-    windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([blank, rows, blank], axis=-1), 2 * half + 1, -1)
+    windows = np.lib.stride_tricks.sliding_window_view(
+        np.concatenate([blank, rows, blank], axis=-1), 2 * half + 1, -1
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # Windows of NaN alone.
         return np.asarray(np.nanmedian(windows, axis=-1))
@@ -254,7 +296,8 @@ def median_filter(values: ArrayLike, time_step: float, window: float = 1.0) -> N
 
 def _over_folds(summaries: Sequence[ErrorSummary]) -> ErrorSummary:
     means = [summary["mean"] for summary in summaries if summary["mean"] is not None]
-    complete, counts = len(means) == len(summaries), [summary["trajectories"] for summary in summaries]
+    complete = len(means) == len(summaries)
+    counts = [summary["trajectories"] for summary in summaries]
     return {
         "mean": float(np.average(means, weights=counts)) if complete else None,
         "std": float(np.std(means)) if complete and len(means) > 1 else None,
@@ -269,13 +312,19 @@ def _finite_mean(values: NDArray[np.float64]) -> float | None:
 
 
 def autocorrelation(series: NDArray[np.float64]) -> list[float]:
-    """Returns the autocorrelation of (T, C) values at lags of 1, 2, ... frames, up to its first zero."""
-    products = [float((series[lag:] * series[: len(series) - lag]).sum()) for lag in range(len(series) // 2)]
+    """Returns the autocorrelation of (T, C) values at lags of 1,
+    2, ... frames, up to its first zero.
+    """
+    products = [
+        float((series[lag:] * series[: len(series) - lag]).sum()) for lag in range(len(series) // 2)
+    ]
     if not products or products[0] <= 0.0:
         return []
     return [value / products[0] for value in takewhile(lambda value: value > 0.0, products[1:])]
 
 
 def redundancy(series: NDArray[np.float64]) -> float:
-    """Returns the number of correlated frames of a series (T, C) with as much information as one independent frame."""
+    """Returns the number of correlated frames of a series (T, C) with as much information
+    as one independent frame.
+    """
     return 1.0 + 2.0 * sum(autocorrelation(series))

@@ -1,4 +1,5 @@
-"""Observed motions of a body: how they begin, and what a simulator and a network need to replay them.
+"""Observed motions of a body: how they begin, and what a simulator
+and a network need to replay them.
 
 `identification`, `reconstruction`, `training` and `evaluation` learn from them and test on them.
 """
@@ -45,8 +46,9 @@ class Identified(Brief):
         parameters: values that all trials share, by name.
         of_trials: values of single trials and sessions, by `parameters.value_name`.
         placement: of the markers, see `placement.placement_of`; None if it is exact.
-        first_frames: first seconds of the trials from which values of a trial or session were estimated that nothing
-            else was identified from, by its name and that of the trial [s]; these frames count in no test error.
+        first_frames: first seconds of the trials from which values of a trial or session were
+            estimated that nothing else was identified from, by its name and that of the trial [s];
+            these frames count in no test error.
         actuator: learned changes of the inputs, by input; from `fit_actuator`.
         test: of the actuator on held-out trials; None: it was not tested.
     """
@@ -60,7 +62,10 @@ class Identified(Brief):
 
     @classmethod
     def of(cls, parameters: "Identified | Mapping[str, float] | None") -> "Identified":
-        """Returns parameters given as a mapping, or none; raises InputError for a value that is no number."""
+        """Returns parameters given as a mapping, or none.
+
+        Raises InputError for a value that is no number.
+        """
         if isinstance(parameters, Identified):
             return parameters
         for name, value in (parameters or {}).items():
@@ -70,7 +75,10 @@ class Identified(Brief):
 
     def values(self, simulator: Simulator) -> dict[str, torch.Tensor]:
         """Returns (1,) values of all parameters, on the device of a simulator."""
-        return {name: simulator.tensor([value]) for name, value in {**self.parameters, **self.of_trials}.items()}
+        return {
+            name: simulator.tensor([value])
+            for name, value in {**self.parameters, **self.of_trials}.items()
+        }
 
 
 @dataclass(frozen=True)
@@ -102,8 +110,9 @@ class ObservedMotions(Brief):
         """Checks that sensors and readings belong together."""
         if odd := {*self.sensors} ^ {*self.trials.loads}:
             raise InputError(
-                f"force sensors are {listed([*self.sensors]) or 'none'}, but the trials have readings of "
-                f"{listed([*self.trials.loads]) or 'none'}: give {listed(sorted(odd))} both, or none."
+                f"force sensors are {listed([*self.sensors]) or 'none'}, but the trials have "
+                f"readings of {listed([*self.trials.loads]) or 'none'}: give "
+                f"{listed(sorted(odd))} both, or none."
             )
 
     @classmethod
@@ -123,19 +132,20 @@ class ObservedMotions(Brief):
 
         Args:
             simulator: of the same time step and body.
-            observed: (T + 1, B, M, D) measured points [unit of `observation`], NaN where a point was not seen; by
-                default positions of all vertices, as in `Motion.q`. (T + 1, M, D) is one motion; None: forces alone.
+            observed: (T + 1, B, M, D) measured points [unit of `observation`], NaN where a point
+                was not seen; by default positions of all vertices, as in `Motion.q`. (T + 1, M, D)
+                is one motion; None: forces alone.
             start: initial positions and velocities; None: at rest in equilibrium under `resting`.
             inputs: during the motion, with or without a time axis.
             resting: inputs before the motion, where `start` is None.
             observation: the sensor, such as markers from `bind_markers`.
-            loads: (T + 1, B, 6) readings of each of the `sensors` [N, N m], NaN where there is none; (T + 1, 6) of one
-                motion.
+            loads: (T + 1, B, 6) readings of each of the `sensors` [N, N m], NaN where there is
+                none; (T + 1, 6) of one motion.
             more: further attributes.
 
         Raises:
-            InputError: observations of a wrong shape or number of points, a start or inputs for another number of
-                motions or steps, or an input that the body does not take.
+            InputError: observations of a wrong shape or number of points, a start or inputs for
+                another number of motions or steps, or an input that the body does not take.
         """
         read = {name: _batched(readings, 3) for name, readings in (loads or {}).items()}
         if observed is None:
@@ -149,18 +159,30 @@ class ObservedMotions(Brief):
             )
         for name, readings in read.items():
             if readings.shape != (wanted := (*observed.shape[:2], 6)):
-                raise InputError(f"readings of {name!r} have shape {tuple(readings.shape)}: it must be {wanted}.")
+                raise InputError(
+                    f"readings of {name!r} have shape {tuple(readings.shape)}: it must be {wanted}."
+                )
         count, frames, like = observed.shape[1], len(observed), simulator.rest_positions
         observation = observation.to(like)
         at_rest = observation(like.expand(count, -1, -1))
         if observed.shape[2] != (seen := at_rest.shape[1]):
-            kind = "vertices of the body" if isinstance(observation, WholeState) else "points of the observation"
-            raise InputError(f"{observed.shape[2]} points were observed, but there are {seen} {kind}.")
+            kind = (
+                "vertices of the body"
+                if isinstance(observation, WholeState)
+                else "points of the observation"
+            )
+            raise InputError(
+                f"{observed.shape[2]} points were observed, but there are {seen} {kind}."
+            )
         points = _array(observed.transpose(0, 1))
-        acting, before = (_fitted(simulator, fields or Inputs(), count) for fields in (inputs, resting))
+        acting, before = (
+            _fitted(simulator, fields or Inputs(), count) for fields in (inputs, resting)
+        )
         acting.check_steps(frames - 1)
         if start is not None and len(start.q) != count:
-            raise InputError(f"start has {len(start.q)} states, but {count} motions were observed: give as many.")
+            raise InputError(
+                f"start has {len(start.q)} states, but {count} motions were observed: give as many."
+            )
         trials = Trials(
             names=tuple(f"motion {number}" for number in range(count)),
             labels=observation.labels,
@@ -171,9 +193,14 @@ class ObservedMotions(Brief):
             payload=np.zeros(count),
             gravity=np.asarray(simulator.gravity, dtype=np.float64),
             time_step=simulator.time_step,
-            bound=_array(at_rest[0]) if observation.labels and isinstance(observation, Markers) else None,
+            bound=_array(at_rest[0])
+            if observation.labels and isinstance(observation, Markers)
+            else None,
             initial=None if start is None else _array(torch.stack([start.q, start.v], 1)),
-            inputs={name: _array(x if axis == 0 else x.transpose(0, 1)) for name, (x, axis) in acting.axes().items()},
+            inputs={
+                name: _array(x if axis == 0 else x.transpose(0, 1))
+                for name, (x, axis) in acting.axes().items()
+            },
             resting={name: _array(x) for name, x in before.fields.items()},
             loads={name: _array(readings.transpose(0, 1)) for name, readings in read.items()},
         )
@@ -182,7 +209,10 @@ class ObservedMotions(Brief):
     def need_points(self, what: str) -> None:
         """Raises InputError where forces alone are observed, by which something is not tested."""
         if isinstance(self.observe, NoPoints):
-            raise InputError(f"{what} is tested on points, and forces alone are observed: observe markers as well.")
+            raise InputError(
+                f"{what} is tested on points, and forces alone are observed: "
+                "observe markers as well."
+            )
 
     @property
     def sees_states(self) -> bool:
@@ -195,13 +225,17 @@ class ObservedMotions(Brief):
         return self.trials.labels or tuple(map(str, range(self.trials.observed.shape[2])))
 
     def batch(self, names: Sequence[str], simulator: Simulator) -> TrialBatch:
-        """Trials that begin in the same way, on the device of a simulator, with inputs at its steps."""
+        """Trials that begin in the same way, on the device of a simulator,
+        with inputs at its steps.
+        """
         arguments = (self.trials, names, simulator.body, self.payload_at, simulator.time_step)
         sensors = tuple(self.sensors[name] for name in self.trials.loads)
         batch = TrialBatch.of(*arguments, sensors=sensors, noise=self.release.noise)
         return batch.to(simulator.rest_positions)
 
-    def replay(self, simulator: Simulator, names: Sequence[str], identified: Identified | None = None) -> Replay:
+    def replay(
+        self, simulator: Simulator, names: Sequence[str], identified: Identified | None = None
+    ) -> Replay:
         """Replay of trials of one batch, with the markers where they were identified."""
         identified = identified or Identified()
         observe, placement = self.observe, identified.placement
@@ -232,11 +266,16 @@ class ObservedMotions(Brief):
                 v = torch.zeros_like(q) if velocity is None else q.new_tensor(velocity[rows, 0])
             return Start(State(q, v), q.new_zeros(len(q)))
         known = {} if identified is None else identified.values(simulator)
-        values = {name: value for name, value in known.items() if split_name(name)[0] in replay.parameter_names} or None
+        values = {
+            name: value
+            for name, value in known.items()
+            if split_name(name)[0] in replay.parameter_names
+        } or None
         if begins == RELEASED:
             return estimate_release(replay, self.release, values)
         guess = simulator.rest_positions.expand(len(trials.names), -1, -1)
-        if begins in (STATIC, UNDER_INPUTS):  # Small changes of a parameter then start close to the solution.
+        if begins in (STATIC, UNDER_INPUTS):
+            # Small changes of a parameter then start close to the solution.
             with contextlib.suppress(ConvergenceError), torch.no_grad():
                 constants, _, resting = replay.prepare(values)
                 guess = simulator.static_equilibrium(resting, constants).q.expand_as(guess)
@@ -245,7 +284,10 @@ class ObservedMotions(Brief):
         return begin_inputs(replay, Start.resting(guess), self.release, values)
 
     def replays(
-        self, simulator: Simulator, names: Sequence[str] | None = None, identified: Identified | None = None
+        self,
+        simulator: Simulator,
+        names: Sequence[str] | None = None,
+        identified: Identified | None = None,
     ) -> list[tuple[Replay, Start]]:
         """Replays of any trials, one for each batch, each with its start."""
         batches = self.trials.batches(self.trials.names if names is None else names)
@@ -260,7 +302,8 @@ class ObservedMotions(Brief):
         return replay.changed(trials=replay.trials.first(seconds))
 
     def targets(self, replay: Replay, start: Start) -> torch.Tensor:
-        """(R, K + 1, M, 3) target positions at a simulator's steps [m], NaN where a marker was not seen.
+        """(R, K + 1, M, 3) target positions at a simulator's steps [m],
+        NaN where a marker was not seen.
 
         Only the part of each trial that is used for training is returned.
         """
@@ -272,11 +315,14 @@ class ObservedMotions(Brief):
             targets, frame = trials.observed, float(trials.times[0, :2].sum())
             if frame and abs(frame - simulator.time_step) > 1e-6 * frame:
                 raise InputError(
-                    f"{trials.names[0]!r} was observed every {1e3 * frame:g} ms, but the step of the simulator is "
-                    f"{1e3 * simulator.time_step:g} ms: reconstruct it with time_step={frame:g}."
+                    f"{trials.names[0]!r} was observed every {1e3 * frame:g} ms, but the step of "
+                    f"the simulator is {1e3 * simulator.time_step:g} ms: reconstruct it with "
+                    f"time_step={frame:g}."
                 )
         else:
-            targets = start.bound(simulator.tensor(at_steps(trials, simulator.time_step, start.delay)))
+            targets = start.bound(
+                simulator.tensor(at_steps(trials, simulator.time_step, start.delay))
+            )
         return targets[:, : self.learned_steps(targets.shape[1] - 1) + 1]
 
     def learned_steps(self, steps: int) -> int:
@@ -286,18 +332,29 @@ class ObservedMotions(Brief):
     def base(self, names: Sequence[str], simulator: Simulator) -> BaseFrame | None:
         """Frame of the base to which the body is fixed in trials; None if the base stands still."""
         poses = self.trials.base_at(names, simulator.time_step)
-        return None if poses is None else BaseFrame(poses.to(simulator.rest_positions), simulator.time_step)
+        return (
+            None
+            if poses is None
+            else BaseFrame(poses.to(simulator.rest_positions), simulator.time_step)
+        )
 
     def _base_movement(self, names: Sequence[str], simulator: Simulator) -> torch.Tensor | None:
-        """(K, R, A) motion of the base during each step as network inputs; None if the base stands still."""
-        poses, mask = self.trials.base_at(names, simulator.time_step), self.base_movement_mask(simulator)
+        """(K, R, A) motion of the base during each step as network inputs.
+
+        None if the base stands still.
+        """
+        poses = self.trials.base_at(names, simulator.time_step)
+        mask = self.base_movement_mask(simulator)
         if poses is None or mask is None:
             return None
         movement = base_movement(poses, simulator.time_step, torch.from_numpy(self.trials.gravity))
         return movement[..., mask].to(simulator.rest_positions)
 
     def base_movement_mask(self, simulator: Simulator) -> torch.Tensor | None:
-        """(15,) bool, components of `base_movement` that vary and are network inputs; None if the base stands still."""
+        """(15,) bool, components of `base_movement` that vary and are network inputs.
+
+        None if the base stands still.
+        """
         poses = self.trials.base_at(self.trials.names, simulator.time_step)
         if poses is None:
             return None
@@ -315,9 +372,10 @@ class ObservedMotions(Brief):
             payload: whether to include the payload even if ``actuation.sees_payload`` is false.
 
         Returns:
-            (R, 1) payloads [kg] if nothing else acts; otherwise (K, R, A) during each step: payloads, inputs (of
-            actuators, and those that move obstacles) with their exponential means, and motion of the base
-            (`base_movement`). (R, A) for static poses, under steady inputs.
+            (R, 1) payloads [kg] if nothing else acts; otherwise (K, R, A) during each step:
+            payloads, inputs (of actuators, and those that move obstacles) with their exponential
+            means, and motion of the base (`base_movement`). (R, A) for static poses, under steady
+            inputs.
         """
         _, inputs, resting = replay.prepare(parameters)
         constant = list[torch.Tensor]()
@@ -335,7 +393,8 @@ class ObservedMotions(Brief):
         response = InputResponse(replay.simulator.time_step, filters=filters)
         series = []
         for name, values in driven.items():
-            values, first = values if values.ndim == 3 else values[None], resting.actuation.get(name)
+            values = values if values.ndim == 3 else values[None]
+            first = resting.actuation.get(name)
             memory = response.steady(0.0 * values[0] if first is None else first)
             series.append(with_means(*response(memory, values)[:2]))
         series += [] if moving is None else [moving]
@@ -353,9 +412,13 @@ def _batched(values: Any, ndim: int) -> torch.Tensor:
 
 
 def _fitted(simulator: Simulator, inputs: Inputs, count: int) -> Inputs:
-    """Returns the inputs of some motions, or raises InputError for those that the body does not take."""
-    fitted = inputs.fitted(simulator.counts, simulator.rest_positions, count).to(simulator.rest_positions)
-    accepted = {name: (quantity, simulator.counts[name]) for name, quantity in simulator.inputs.items()}
+    """The inputs of some motions, or raises InputError for those that the body does not take."""
+    fitted = inputs.fitted(simulator.counts, simulator.rest_positions, count).to(
+        simulator.rest_positions
+    )
+    accepted = {
+        name: (quantity, simulator.counts[name]) for name, quantity in simulator.inputs.items()
+    }
     vertices, fixed = simulator.body.n_vertices, len(simulator.fixed)
     fitted.at(0).check(accepted, count, vertices, fixed, simulator.rest_positions)
     return fitted

@@ -1,7 +1,8 @@
-"""Errors of the marker places on the body and of the recording's frame, estimated beside the physical parameters.
+"""Errors of the marker places on the body and of the recording's frame,
+estimated beside the physical parameters.
 
-Marker m sits at an offset b_m from its nominal place on the body, and the frame of the recordings is shifted by t and
-rotated by w about a centre c, so that a simulated marker y_m is observed at
+Marker m sits at an offset b_m from its nominal place on the body, and the frame of the recordings
+is shifted by t and rotated by w about a centre c, so that a simulated marker y_m is observed at
 
     x = c + R(w) (y_m(q; b_m) - c) + t
 
@@ -30,11 +31,12 @@ class Accuracy:
         markers: of each coordinate of a marker's place on the body [m].
         shift: of each coordinate of the origin of the recording's frame [m].
         turn: of each component of its rotation vector [rad].
-        between_sessions: of the placement of a session from the common one, relative to the deviations above.
-        mounting: of each component of the rotation vector of a rigid body on the part that carries it [rad]; its
-            position has that of markers.
-        rigid_bodies: index of the first of the four points of each rigid body, and these on the undeformed body,
-            (4, 3) relative to their mean [m].
+        between_sessions: of the placement of a session from the common one, relative to the
+            deviations above.
+        mounting: of each component of the rotation vector of a rigid body on the part that carries
+            it [rad]; its position has that of markers.
+        rigid_bodies: index of the first of the four points of each rigid body, and these on the
+            undeformed body, (4, 3) relative to their mean [m].
         centre: (3,) about which recordings may be rotated [m].
     """
 
@@ -47,29 +49,37 @@ class Accuracy:
     centre: Sequence[float] = (0.0, 0.0, 0.0)
 
     def directions(self, like: torch.Tensor) -> torch.Tensor:
-        """(3 M + 6, K) offsets, shift and turn by one standard deviation, for a tensor (..., M, 3) like the markers.
+        """(3 M + 6, K) offsets, shift and turn by one standard deviation,
+        for a tensor (..., M, 3) like the markers.
 
-        A marker has three offsets; the points of a rigid body are shifted and turned together, to first order.
+        A marker has three offsets; the points of a rigid body are shifted and turned together, to
+        first order.
         """
         count = like.shape[-2]
-        sizes = [self.markers or 0.0] * (3 * count) + [self.shift or 0.0] * 3 + [self.turn or 0.0] * 3
+        sizes = (
+            [self.markers or 0.0] * (3 * count) + [self.shift or 0.0] * 3 + [self.turn or 0.0] * 3
+        )
         directions = torch.diag(like.new_tensor(sizes))
         kept = torch.ones(len(sizes), dtype=torch.bool)
         for first, corners in self.rigid_bodies:
             rows, eye = slice(3 * first, 3 * first + 12), torch.eye(3).to(like)
             arms = like.new_tensor(corners)[:, None].expand(4, 3, 3)
-            turned = torch.linalg.cross(eye.expand(4, 3, 3), arms, dim=-1).mT  # (4, 3, 3) of a point, by the rotation
+            # (4, 3, 3) of a point, by the rotation
+            turned = torch.linalg.cross(eye.expand(4, 3, 3), arms, dim=-1).mT
             directions[rows, rows] = 0.0
             directions[rows, 3 * first : 3 * first + 3] = (self.markers or 0.0) * eye.repeat(4, 1)
-            directions[rows, 3 * first + 3 : 3 * first + 6] = (self.mounting or 0.0) * turned.flatten(0, 1)
+            directions[rows, 3 * first + 3 : 3 * first + 6] = (
+                self.mounting or 0.0
+            ) * turned.flatten(0, 1)
             kept[3 * first + 6 : 3 * first + 12] = False
         return directions[:, kept.to(like.device)]
 
     def of_new_session(self, like: torch.Tensor, sessions: int) -> torch.Tensor:
         """Standard deviations of a new session's placement from the common one of n sessions.
 
-        The session's own deviation has the variance b^2 s^2, with b of `between_sessions` and s of all. That of the
-        common placement, of which every exactly known session is one draw, is s^2 / (1 + n / b^2).
+        The session's own deviation has the variance b^2 s^2, with b of `between_sessions` and s of
+        all. That of the common placement, of which every exactly known session is one draw, is
+        s^2 / (1 + n / b^2).
 
         Args:
             like: (..., M, 3) like the markers.
@@ -103,7 +113,8 @@ class Placement:
     """Marker places on the body, and the frame of the recordings.
 
     Attributes:
-        offsets: (M, 3) of the markers from their nominal places, in the frame of the body at rest [m].
+        offsets: (M, 3) of the markers from their nominal places, in the frame of the body at rest
+            [m].
         shift: (3,) of the recording's frame [m].
         turn: (3,) its rotation vector [rad].
         centre: (3,) about which it is rotated [m].
@@ -128,7 +139,9 @@ class Placement:
         return Placement(*(t.to(like) for t in (self.offsets, self.shift, self.turn, self.centre)))
 
     def places(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns placed markers (..., M, 3) [m] and the body's rotations there, from points of `DisplacedMarkers`."""
+        """Returns placed markers (..., M, 3) [m] and the body's rotations there,
+        from points of `DisplacedMarkers`.
+        """
         markers, rotations = DisplacedMarkers.split(points)
         return self.apply(markers + (rotations @ self.offsets[..., None])[..., 0]), rotations
 
@@ -148,12 +161,18 @@ class Placement:
     def from_plain(cls, plain: PlainPlacement, labels: Sequence[str]) -> "Placement":
         """Returns the placement that `plain` wrote."""
         offsets = torch.tensor([plain["offsets"][label] for label in labels], dtype=torch.float64)
-        frame = (torch.tensor(x, dtype=torch.float64) for x in (plain["shift"], plain["turn"], plain["centre"]))
+        frame = (
+            torch.tensor(x, dtype=torch.float64)
+            for x in (plain["shift"], plain["turn"], plain["centre"])
+        )
         return cls(offsets, *frame)
 
 
 def placement_of(plain: PlainPlacements, labels: Sequence[str], session: str = "") -> Placement:
-    """Returns the placement of a session from `Nuisances.plain`; the common one for a session that is not known."""
+    """Returns the placement of a session from `Nuisances.plain`.
+
+    The common one for a session that is not known.
+    """
     return Placement.from_plain(plain.get("sessions", {}).get(session, plain), labels)
 
 
@@ -177,8 +196,8 @@ class PlacedMarkers(Markers):
 class DisplacedMarkers(Observation):
     """M markers and three copies of them, displaced by 1 m along each axis of the body at rest.
 
-    Markers are linear in their offsets, so that the copies give the derivative by an offset: the rotation of the body
-    at the marker.
+    Markers are linear in their offsets, so that the copies give the derivative by an offset: the
+    rotation of the body at the marker.
 
     Args:
         markers: nominal markers.
@@ -198,7 +217,10 @@ class DisplacedMarkers(Observation):
             InputError: something else than markers is observed.
         """
         if not isinstance(replay.observe, Markers):
-            raise InputError("where the markers sit can be identified of markers alone: leave identify.placement out.")
+            raise InputError(
+                "where the markers sit can be identified of markers alone: leave "
+                "identify.placement out."
+            )
         observe = cls(replay.observe, replay.trials.observed.shape[2])
         shift = None if start.shift is None else start.shift.repeat(1, len(observe._all), 1)
         return replay.changed(observe=observe), replace(start, shift=shift)
@@ -214,13 +236,18 @@ class DisplacedMarkers(Observation):
 
     @staticmethod
     def split(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Markers (..., M, 3) [m] and the rotations of the body there (..., M, 3, 3), from points (..., 4 M, 3)."""
+        """Markers (..., M, 3) [m] and the rotations of the body there (..., M, 3, 3),
+        from points (..., 4 M, 3).
+        """
         markers, *displaced = points.chunk(4, -2)
         return markers, torch.stack([copy - markers for copy in displaced], -1)
 
 
-def by_placement(placement: Placement, placed: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
-    """Returns derivatives (R, T, M, 3, P) of placed markers by the offsets, the shift and the rotation vector.
+def by_placement(
+    placement: Placement, placed: torch.Tensor, rotations: torch.Tensor
+) -> torch.Tensor:
+    """Returns derivatives (R, T, M, 3, P) of placed markers by the offsets,
+    the shift and the rotation vector.
 
     R(w + dw) = R(J dw) R(w), with J the left Jacobian of SO(3).
 
@@ -230,15 +257,23 @@ def by_placement(placement: Placement, placed: torch.Tensor, rotations: torch.Te
         rotations: (R, T, M, 3, 3) of the body at the markers.
     """
     count, eye = placed.shape[-2], torch.eye(3, dtype=placed.dtype, device=placed.device)
-    turn = replace(placement, shift=torch.zeros_like(placement.shift), centre=torch.zeros_like(placement.centre))
+    turn = replace(
+        placement,
+        shift=torch.zeros_like(placement.shift),
+        centre=torch.zeros_like(placement.centre),
+    )
     rotation, angle = turn.apply(eye).T, placement.turn.norm()
     cross = torch.linalg.cross(placement.turn.expand(3, 3), eye, dim=-1).T
     first, second = 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0  # series for small angles
     jacobian = eye + first * cross + second * cross @ cross
     columns = placed.new_zeros(*placed.shape, 3 * count + 6)
     for marker in range(count):
-        columns[..., marker, :, 3 * marker : 3 * marker + 3] = rotation @ rotations[..., marker, :, :]
+        columns[..., marker, :, 3 * marker : 3 * marker + 3] = (
+            rotation @ rotations[..., marker, :, :]
+        )
     columns[..., -6:-3] = eye
     arm = (placed - placement.shift - placement.centre)[..., None]
-    columns[..., -3:] = torch.linalg.cross(jacobian.expand(*arm.shape[:-1], 3), arm.expand(*arm.shape[:-1], 3), dim=-2)
+    columns[..., -3:] = torch.linalg.cross(
+        jacobian.expand(*arm.shape[:-1], 3), arm.expand(*arm.shape[:-1], 3), dim=-2
+    )
     return columns

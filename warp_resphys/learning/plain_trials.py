@@ -1,4 +1,4 @@
-"""Trials as predictions without physics see them, and the terms in which their inputs drive a body."""
+"""Trials as predictions without physics see them, and terms in which their inputs drive a body."""
 
 import math
 from dataclasses import dataclass, replace
@@ -15,7 +15,9 @@ _MOST_TERMS: Final = 100
 
 @dataclass(frozen=True)
 class PlainTrials:
-    """R trials of which T frames of P coordinates were observed; a static pose is a trial of one frame.
+    """R trials of which T frames of P coordinates were observed.
+
+    A static pose is a trial of one frame.
 
     Attributes:
         values: (R, T, P) [m], NaN where a coordinate was not seen.
@@ -46,14 +48,18 @@ class PlainTrials:
         return self.values - self.origin[:, None]
 
     def features(self, like: "PlainTrials") -> FloatArray:
-        """(R, T' C + F + P) what distinguishes trials: inputs, loads, and displacements before time zero.
+        """(R, T' C + F + P) what distinguishes trials:
+        inputs, loads, and displacements before time zero.
 
         Args:
-            like: the training trials, whose mean displacement before time zero is the unit of displacements. Inputs
-                count in the T' frames up to their end.
+            like: the training trials, whose mean displacement before time zero is the unit of
+                displacements. Inputs count in the T' frames up to their end.
         """
         frames = int(np.flatnonzero(np.isfinite(like.values).any((0, 2)))[-1]) + 1
-        parts = [self.inputs[:, :frames].reshape(len(self.inputs), -1) / np.sqrt(frames), self.known]
+        parts = [
+            self.inputs[:, :frames].reshape(len(self.inputs), -1) / np.sqrt(frames),
+            self.known,
+        ]
         size = np.linalg.norm(like.displaced, axis=1).mean()
         return np.concatenate([*parts, *([self.displaced / size] if size > 0.0 else [])], 1)
 
@@ -72,7 +78,9 @@ class Prediction:
 
 
 def degrees(trials: PlainTrials) -> list[int]:
-    """Degrees of a linear model in the inputs, fewer than trials, among which leaving trials out can choose."""
+    """Degrees of a linear model in the inputs, fewer than trials,
+    among which leaving trials out can choose.
+    """
     count = len(acting_columns(trials))
     few = [degree for degree in _DEGREES if math.comb(count + degree, degree) <= _MOST_TERMS + 1]
     return [1, *(degree for degree in few if 1 < degree < len(trials.values) and count)]
@@ -84,12 +92,18 @@ def acting_columns(trials: PlainTrials) -> IntArray:
 
 
 def driving_terms(motions: PlainTrials, trials: PlainTrials, degree: int) -> FloatArray:
-    """(R, T, D) powers and products of the inputs and loads of motions that act in training trials, and a constant."""
+    """(R, T, D) powers and products of the inputs and loads of motions
+    that act in training trials, and a constant.
+    """
     frames = motions.inputs.shape[1]
-    known = np.broadcast_to(motions.known[:, None], (len(motions.known), frames, motions.known.shape[1]))
+    known = np.broadcast_to(
+        motions.known[:, None], (len(motions.known), frames, motions.known.shape[1])
+    )
     inputs = np.concatenate([motions.inputs, known], 2)
     chosen = (
-        c for d in range(1, degree + 1) for c in combinations_with_replacement(acting_columns(trials).tolist(), d)
+        c
+        for d in range(1, degree + 1)
+        for c in combinations_with_replacement(acting_columns(trials).tolist(), d)
     )
     columns = [inputs[..., list(term)].prod(-1) for term in chosen]
     return np.stack([*columns, np.ones(inputs.shape[:2])], 2)

@@ -1,7 +1,8 @@
 """The simulation of observed trials.
 
-A replay simulates every trial from its own start, under its own inputs, for one or several sets of physical parameters
-at once, and interpolates the observation at the times of the frames. All of it is differentiable.
+A replay simulates every trial from its own start, under its own inputs, for one or several sets of
+physical parameters at once, and interpolates the observation at the times of the frames. All of it
+is differentiable.
 """
 
 import itertools
@@ -23,7 +24,14 @@ from ..io.errors import ConvergenceError, InputError
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import on_steps, rollout, sample, states
 from ..stepping.state import State
-from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters, split_name
+from .parameters import (
+    HUNG,
+    MASS_FACTOR,
+    check_names,
+    constants_of,
+    identifiable_parameters,
+    split_name,
+)
 from .residuals.correction import acts_of
 from .residuals.feedback import equilibrium_under_feedback
 from .sensing import readings
@@ -53,11 +61,12 @@ class Replay:
         actuator: learned changes of inputs, by input; None without any.
 
     Attributes:
-        parameter_names: names of the accepted parameters: scalar constants of the simulator; those of each part of an
-            energy, such as ``tendon_stiffness_left`` of a tendon ``left``; a factor on the weights that hang on the
-            body; components of gravity's tilt; and for every input a factor on its commands, their delay [s], the rise
-            time [s] of its response, its reciprocal slew rate, its dead band, its zero, its backlash and the
-            slopes of its characteristic curve: ``pressure_factor``, ``pressure_delay``, ``pressure_rise``,
+        parameter_names: names of the accepted parameters: scalar constants of the simulator; those
+            of each part of an energy, such as ``tendon_stiffness_left`` of a tendon ``left``; a
+            factor on the weights that hang on the body; components of gravity's tilt; and for every
+            input a factor on its commands, their delay [s], the rise time [s] of its response, its
+            reciprocal slew rate, its dead band, its zero, its backlash and the slopes of its
+            characteristic curve: ``pressure_factor``, ``pressure_delay``, ``pressure_rise``,
             ``pressure_slew``, ``pressure_dead_band``, ``pressure_zero``, ``pressure_backlash`` and
             ``pressure_slope_1``.
     """
@@ -69,21 +78,33 @@ class Replay:
         trials: TrialBatch,
         actuator: Mapping[str, InputNetwork] | None = None,
     ) -> None:
-        self.simulator, self.observe, self.trials, self.actuator = simulator, observe, trials, actuator or {}
+        self.simulator, self.observe, self.trials, self.actuator = (
+            simulator,
+            observe,
+            trials,
+            actuator or {},
+        )
         self.parameter_names = identifiable_parameters(simulator)
-        self._shaped = tuple(name for name, q in simulator.parameters.items() if q.shape and name != "gravity")
+        self._shaped = tuple(
+            name for name, q in simulator.parameters.items() if q.shape and name != "gravity"
+        )
 
     def changed(self, **fields: Any) -> "Replay":
         """Returns a replay with other arguments."""
-        kept = {name: getattr(self, name) for name in ("simulator", "observe", "trials", "actuator")}
+        kept = {
+            name: getattr(self, name) for name in ("simulator", "observe", "trials", "actuator")
+        }
         return Replay(**{**kept, **fields})
 
     def prepare(self, parameters: Parameters | None = None) -> Prepared:
-        """Returns constants and inputs of E sets of parameters and R trials, as (E R) environments; trials run fastest.
+        """Returns constants and inputs of E sets of parameters and R trials, as (E R) environments.
+
+        Trials run fastest.
 
         Args:
-            parameters: (E,) values, by any of `parameter_names`, or (E, W) of a constant with W values; values of
-                single trials or sessions by `parameters.value_name`, beside the common value.
+            parameters: (E,) values, by any of `parameter_names`, or (E, W) of a constant with W
+                values; values of single trials or sessions by `parameters.value_name`, beside the
+                common value.
 
         Returns:
             The constants, the inputs of the trials, and those before time zero.
@@ -102,26 +123,43 @@ class Replay:
         if MASS_FACTOR in spread:
             hung = {name: weight * spread[MASS_FACTOR][:, None] for name, weight in hung.items()}
         acting, before = self._acting(inputs, resting, spread)
-        return sim.prepare(constants), inputs.replace(**acting, **hung), resting.replace(**before, **hung)
+        return (
+            sim.prepare(constants),
+            inputs.replace(**acting, **hung),
+            resting.replace(**before, **hung),
+        )
 
     def _spread(self, parameters: Parameters, sets: int) -> dict[str, torch.Tensor]:
-        """(E R,) values in all environments, from (E,) values; those of trials and sessions replace the common ones."""
+        """(E R,) values in all environments, from (E,) values.
+
+        Those of trials and sessions replace the common ones.
+        """
         count = len(self.trials.names)
-        spread = {name: v.repeat_interleave(count, 0) for name, v in parameters.items() if not split_name(name)[1]}
+        spread = {
+            name: v.repeat_interleave(count, 0)
+            for name, v in parameters.items()
+            if not split_name(name)[1]
+        }
         for name, value in parameters.items():
             parameter, owner = split_name(name)
             mine = [owner in (trial, self.trials.session) for trial in self.trials.names]
             if owner and parameter not in spread:
-                raise InputError(f"{name} is the value of one trial: give {parameter}, that of the others, too.")
+                raise InputError(
+                    f"{name} is the value of one trial: give {parameter}, that of the others, too."
+                )
             if owner and any(mine):
                 rows = torch.tensor(mine, device=value.device).repeat(sets)
-                spread[parameter] = torch.where(rows, value.repeat_interleave(count, 0), spread[parameter])
+                spread[parameter] = torch.where(
+                    rows, value.repeat_interleave(count, 0), spread[parameter]
+                )
         return spread
 
     def _acting(
         self, inputs: Inputs, resting: Inputs, spread: Parameters
     ) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
-        """Inputs that act under the commanded ones, during and before the trials, with parameters (E R,)."""
+        """Inputs that act under the commanded ones,
+        during and before the trials, with parameters (E R,).
+        """
         acting, before = {}, {}
         for name, commands in inputs.actuation.items():
             if name in HUNG:
@@ -131,17 +169,27 @@ class Replay:
             response = InputResponse(self.simulator.time_step, **arguments)
             throughout = commands.ndim == 2
             first = resting.actuation.get(name, 0.0 * (commands if throughout else commands[0]))
-            acting[name] = response.still(commands) if throughout else response(response.steady(first), commands)[0]
+            acting[name] = (
+                response.still(commands)
+                if throughout
+                else response(response.steady(first), commands)[0]
+            )
             if name in resting.actuation or arguments.get("zero") is not None:
                 before[name] = response.still(first)
         return acting, before
 
     def initial_state(
-        self, start: Start, constants: Constants, resting: Inputs, sets: int = 1, force: StepForce | None = None
+        self,
+        start: Start,
+        constants: Constants,
+        resting: Inputs,
+        sets: int = 1,
+        force: StepForce | None = None,
     ) -> State:
         """Initial states (E R) of the trials, with the constants and resting inputs of `prepare`.
 
-        The state-dependent force acts on static poses only: they are in equilibrium with the force at that equilibrium.
+        The state-dependent force acts on static poses only: they are in equilibrium with the force
+        at that equilibrium.
 
         Args:
             start: of the R trials.
@@ -151,7 +199,8 @@ class Replay:
             force: (B, N, 3) added force [N] of the state and the number of the step.
 
         Raises:
-            ConvergenceError: there is no equilibrium, or `equilibrium_under_feedback` does not converge.
+            ConvergenceError: there is no equilibrium, or `equilibrium_under_feedback` does not
+                converge.
         """
         batch = sets * len(self.trials.names)
         q, v = (t.repeat(batch // len(t), 1, 1) for t in (start.state.q, start.state.v))
@@ -167,15 +216,24 @@ class Replay:
         return self.trials.observed.shape[1] == 1 and not bool(self.trials.times.any())
 
     def steps(self, start: Start) -> int:
-        """Number of steps to the last frame; one more, for the slope there, where frames are between two steps."""
+        """Number of steps to the last frame.
+
+        One more, for the slope there, where frames are between two steps.
+        """
         times = (self.trials.times - start.delay[:, None]).clamp_min(0.0)
         last = float(times.max()) / self.simulator.time_step
-        return round(last) if on_steps(times, self.simulator.time_step) else max(math.ceil(last - 1e-6) + 1, 2)
+        return (
+            round(last)
+            if on_steps(times, self.simulator.time_step)
+            else max(math.ceil(last - 1e-6) + 1, 2)
+        )
 
     def __call__(
         self, start: Start, parameters: Parameters | None = None, force: StepForce | None = None
     ) -> torch.Tensor:
-        """(E, R, T, M, 3) simulated points at the times of the frames [m]; before its release a body stands still.
+        """(E, R, T, M, 3) simulated points at the times of the frames [m].
+
+        Before its release a body stands still.
 
         Args:
             start: of the R trials.
@@ -187,17 +245,24 @@ class Replay:
         """
         return self.sensed(start, parameters, force)[0]
 
-    def sensed(self, start: Start, parameters: Parameters | None = None, force: StepForce | None = None) -> Sensed:
+    def sensed(
+        self, start: Start, parameters: Parameters | None = None, force: StepForce | None = None
+    ) -> Sensed:
         """Points as of a call, and the readings of the sensors (E, R, T, S, 6) [N, N m]."""
         return self._of_sets(self._series(start, parameters, force), start, _count(parameters))
 
     def series(
         self, start: Start, parameters: Parameters | None = None, force: StepForce | None = None
     ) -> torch.Tensor:
-        """(E R, K + 1, M, 3) simulated points at the steps [m], from the release on; for the arguments, see a call."""
+        """(E R, K + 1, M, 3) simulated points at the steps [m], from the release on.
+
+        For the arguments, see a call.
+        """
         return self._series(start, parameters, force)[0]
 
-    def _series(self, start: Start, parameters: Parameters | None, force: StepForce | None) -> Sensed:
+    def _series(
+        self, start: Start, parameters: Parameters | None, force: StepForce | None
+    ) -> Sensed:
         """Points as of `series`, and readings (E R, K + 1, S, 6) at the steps [N, N m]."""
         constants, inputs, resting = self.prepare(parameters)
 
@@ -209,16 +274,22 @@ class Replay:
 
         begun = self.initial_state(start, constants, resting, _count(parameters), force)
         first = begun, self._first_reading(start, begun, resting, constants)
-        seen = rollout(step, first, range(self.steps(start)), lambda now: (self.observe(now[0].q), now[1]))
+        seen = rollout(
+            step, first, range(self.steps(start)), lambda now: (self.observe(now[0].q), now[1])
+        )
         points, loads = (torch.stack([*values], 1) for values in zip(*seen, strict=True))
         return points, loads
 
-    def read(self, after: State, before: State | None, inputs: Inputs, constants: Constants) -> torch.Tensor:
+    def read(
+        self, after: State, before: State | None, inputs: Inputs, constants: Constants
+    ) -> torch.Tensor:
         """Returns `readings` of the sensors of the trials."""
         return readings(self.simulator, self.trials.sensors, after, before, inputs, constants)
 
-    def _first_reading(self, start: Start, state: State, resting: Inputs, constants: Constants) -> torch.Tensor:
-        """Returns the readings (B, S, 6) of the initial state, NaN where no equilibrium led there [N, N m]."""
+    def _first_reading(
+        self, start: Start, state: State, resting: Inputs, constants: Constants
+    ) -> torch.Tensor:
+        """Readings (B, S, 6) of the initial state, NaN where no equilibrium led there [N, N m]."""
         if start.at_rest:
             return self.read(state, None, resting, constants)
         return state.q.new_full((state.batch, len(self.trials.sensors), 6), torch.nan)
@@ -228,9 +299,11 @@ class Replay:
         """K + 1 states of R trials at the steps, from the release on, with one set of parameters.
 
         Args:
-            start: of the R trials, or of these for several sets of parameters, of which the first are taken.
+            start: of the R trials, or of these for several sets of parameters, of which the first
+                are taken.
             parameters: (1,) values, by any of `parameter_names`.
-            near: predicts the positions (R, N, 3) of a state by its number [m], see `Simulator.step`.
+            near: predicts the positions (R, N, 3) of a state by its number [m], see
+                `Simulator.step`.
 
         Raises:
             ConvergenceError: see `Simulator.step`.
@@ -247,18 +320,26 @@ class Replay:
                     log.debug("the step is solved again without a prediction: %s", error)
             return self.simulator.step(state, inputs.at(k), constants)
 
-        return [*states(step, self.initial_state(first, constants, resting), range(self.steps(start)))]
+        return [
+            *states(step, self.initial_state(first, constants, resting), range(self.steps(start)))
+        ]
 
     def _observed(self, positions: Iterable[torch.Tensor]) -> torch.Tensor:
-        """(B, K, M, 3) points at K positions (B, N, 3) [m], `_AT_ONCE` in a call, which is mostly overhead."""
+        """(B, K, M, 3) points at K positions (B, N, 3) [m],
+        `_AT_ONCE` in a call, which is mostly overhead.
+        """
         series, rest = list[torch.Tensor](), iter(positions)
         while some := list(itertools.islice(rest, _AT_ONCE)):
-            series.append(self.observe(torch.cat(some)).unflatten(0, (len(some), -1)).transpose(0, 1))
+            series.append(
+                self.observe(torch.cat(some)).unflatten(0, (len(some), -1)).transpose(0, 1)
+            )
         return torch.cat(series, 1)
 
     @torch.no_grad()
     def observed(self, start: Start, states: Sequence[State], parameters: Parameters) -> Sensed:
-        """Points (1, R, T, M, 3) [m] and readings (1, R, T, S, 6) [N, N m] at the frames, from `states`."""
+        """Points (1, R, T, M, 3) [m] and readings (1, R, T, S, 6) [N, N m]
+        at the frames, from `states`.
+        """
         points = self._observed(state.q for state in states)
         if not self.trials.sensors:
             return self._of_sets((points, points.new_zeros(*points.shape[:2], 0, 6)), start, 1)
@@ -269,37 +350,59 @@ class Replay:
         return self._of_sets((points, torch.stack(loads, 1)), start, 1)
 
     def varied(
-        self, start: Start, parameters: Parameters, states: Sequence[State] | None = None, record: Record | None = None
+        self,
+        start: Start,
+        parameters: Parameters,
+        states: Sequence[State] | None = None,
+        record: Record | None = None,
     ) -> Sensed:
-        """Points and readings as of `sensed`, for sets of parameters that hardly differ from the first."""
-        return self._of_sets(self._varied_series(start, parameters, states, record), start, _count(parameters))
+        """Points and readings as of `sensed`, for sets of parameters
+        that hardly differ from the first.
+        """
+        return self._of_sets(
+            self._varied_series(start, parameters, states, record), start, _count(parameters)
+        )
 
     def varied_series(self, start: Start, parameters: Parameters) -> torch.Tensor:
-        """(E R, K + 1, M, 3) points as of `series`, for sets of parameters that hardly differ from the first."""
+        """(E R, K + 1, M, 3) points as of `series`,
+        for sets of parameters that hardly differ from the first.
+        """
         return self._varied_series(start, parameters, None, None)[0]
 
     @torch.no_grad()
     def _varied_series(
-        self, start: Start, parameters: Parameters, states: Sequence[State] | None, record: Record | None
+        self,
+        start: Start,
+        parameters: Parameters,
+        states: Sequence[State] | None,
+        record: Record | None,
     ) -> Sensed:
-        """Points (E R, K + 1, M, 3) and readings (E R, K + 1, S, 6) at the steps, for sets that hardly differ.
+        """Points (E R, K + 1, M, 3) and readings (E R, K + 1, S, 6) at the steps,
+        for sets that hardly differ.
 
-        The first set is simulated. In its equilibrium and each of its steps, with the solution x, the residual g(x) and
-        its derivative H, the solutions of the others are x - H^-1 (g'(x) - g(x)), one step of Newton's method from
-        there: differences to the first set are exact to first order, for one factor and one residual each.
+        The first set is simulated. In its equilibrium and each of its steps, with the solution x,
+        the residual g(x) and its derivative H, the solutions of the others are
+        x - H^-1 (g'(x) - g(x)), one step of Newton's method from there: differences to the first
+        set are exact to first order, for one factor and one residual each.
 
         Args:
             start: of the R trials, or of these for each set of parameters.
             parameters: (E,) values, by any of `parameter_names`; E is two or more.
             states: `states` of the first set; simulated if omitted.
-            record: called for each state with the positions (R, N, 3) of the first set and those of the others [m].
+            record: called for each state with the positions (R, N, 3) of the first set and those of
+                the others [m].
 
         Raises:
             ConvergenceError: see `Simulator.step`.
         """
-        first, others = ({name: value[chosen] for name, value in parameters.items()} for chosen in (_FIRST, _OTHERS))
+        first, others = (
+            {name: value[chosen] for name, value in parameters.items()}
+            for chosen in (_FIRST, _OTHERS)
+        )
         states = self.states(start, first) if states is None else states
-        return self.varied_points(start, self.prepare(first), self.prepare(others), _count(others), states, record)
+        return self.varied_points(
+            start, self.prepare(first), self.prepare(others), _count(others), states, record
+        )
 
     def varied_points(
         self,
@@ -310,7 +413,9 @@ class Replay:
         states: Sequence[State],
         record: Record | None = None,
     ) -> Sensed:
-        """Points and readings as of `_varied_series`, from constants and inputs of `prepare` of E - 1 sets."""
+        """Points and readings as of `_varied_series`,
+        from constants and inputs of `prepare` of E - 1 sets.
+        """
         loads = list[torch.Tensor]()
 
         def positions() -> Iterator[torch.Tensor]:
@@ -322,10 +427,22 @@ class Replay:
         return points, torch.stack(loads, 1)
 
     def _varied_positions(
-        self, start: Start, first: Prepared, others: Prepared, sets: int, states: Sequence[State], record: Record | None
+        self,
+        start: Start,
+        first: Prepared,
+        others: Prepared,
+        sets: int,
+        states: Sequence[State],
+        record: Record | None,
     ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-        """Yields positions (E R, N, 3) of `varied_series` [m], and readings, from the release on."""
-        (constants, inputs, resting), (their, their_inputs, their_resting), state = first, others, states[0]
+        """Yields positions (E R, N, 3) of `varied_series` [m],
+        and readings, from the release on.
+        """
+        (constants, inputs, resting), (their, their_inputs, their_resting), state = (
+            first,
+            others,
+            states[0],
+        )
         if not start.at_rest:
             whole = self.initial_state(start, constants, resting, 1 + sets)
             varied = whole.map(lambda t: t[state.batch :])
@@ -345,21 +462,36 @@ class Replay:
             try:
                 there = self._beside[1].linearise(varied, their_inputs.at(k), their)
             except InputError as error:
-                message = f"the motion depends so much on the parameters that it has no derivatives from step {k} on."
+                message = (
+                    "the motion depends so much on the parameters that it has no derivatives "
+                    f"from step {k} on."
+                )
                 raise ConvergenceError(message, None, None) from error
             before, acting = varied, their_inputs.at(k)
             x = self.simulator.method.solution_for(state, solved.q)
             solved, varied = self._varied(solved, x, here, there)
-            read = [self.read(solved, state, inputs.at(k), constants), self.read(varied, before, acting, their)]
+            read = [
+                self.read(solved, state, inputs.at(k), constants),
+                self.read(varied, before, acting, their),
+            ]
             yield torch.cat([solved.q, varied.q]), torch.cat(read)
             if record is not None:
                 record(solved.q, varied.q)
 
-    def _varied(self, solved: State, x: torch.Tensor, here: Linearisation, there: Linearisation) -> tuple[State, State]:
-        """Returns the state with the solution (R, N, 3) x [m], and those of the other sets; reactions at rounded x."""
+    def _varied(
+        self, solved: State, x: torch.Tensor, here: Linearisation, there: Linearisation
+    ) -> tuple[State, State]:
+        """Returns the state with the solution (R, N, 3) x [m], and those of the other sets.
+
+        Reactions at rounded x.
+        """
         near, sensed = first_order(x, here, there), bool(self.trials.sensors)
         found = there.reached(near) if sensed else there.finish(near)
-        varied = found if found.q.dtype == x.dtype else found.map(lambda t: t.to(x) if t.is_floating_point() else t)
+        varied = (
+            found
+            if found.q.dtype == x.dtype
+            else found.map(lambda t: t.to(x) if t.is_floating_point() else t)
+        )
         reaction = here.reached(x).reaction if sensed else solved.reaction
         return replace(solved, reaction=reaction), replace(varied, reaction=found.reaction)
 
@@ -369,7 +501,7 @@ class Replay:
         return replace(self.simulator), replace(self.simulator)
 
     def _of_sets(self, series: Sensed, start: Start, sets: int) -> Sensed:
-        """Points (E, R, T, M, 3) and readings (E, R, T, S, 6) at the frames, from those at the steps."""
+        """Points (E, R, T, M, 3) and readings (E, R, T, S, 6) at frames, from those at steps."""
         points, loads = self.at_frames(series[0], start), self.loads_at_frames(series[1], start)
         return points.unflatten(0, (sets, -1)), loads.unflatten(0, (sets, -1))
 
@@ -379,12 +511,17 @@ class Replay:
         return start.shifted(points.unflatten(0, (sets, -1))).flatten(0, 1)
 
     def loads_at_frames(self, series: torch.Tensor, start: Start) -> torch.Tensor:
-        """Readings (E R, T, S, 6) at the frames, from those of the steps; the midpoint rule has them in its middle."""
+        """Readings (E R, T, S, 6) at the frames, from those of the steps.
+
+        The midpoint rule has them in its middle.
+        """
         halves = self.simulator.integrator == "midpoint" and series.shape[1] > 2
         return self._at_times(series, start, 0.5 * self.simulator.time_step * halves)
 
     def _at_times(self, series: torch.Tensor, start: Start, ahead: float = 0.0) -> torch.Tensor:
-        """Values (E R, T, ...) at the frames, from those at the steps, which belong to a time before the end [s]."""
+        """Values (E R, T, ...) at the frames, from those at the steps,
+        which belong to a time before the end [s].
+        """
         times = (self.trials.times - start.delay[:, None]).clamp_min(0.0) + ahead
         return sample(series, times.repeat(len(series) // len(times), 1), self.simulator.time_step)
 

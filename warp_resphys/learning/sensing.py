@@ -1,4 +1,7 @@
-"""What was observed at the frames of trials, at the steps of a simulator; readings of force sensors in a step."""
+"""What was observed at the frames of trials, at the steps of a simulator.
+
+Readings of force sensors in a step.
+"""
 
 from collections.abc import Sequence
 
@@ -25,7 +28,7 @@ def readings(
     inputs: Inputs,
     constants: Constants,
 ) -> torch.Tensor:
-    """Returns the readings (B, S, 6) of force sensors at the end of a step, differentiable [N, N m].
+    """Returns readings (B, S, 6) of force sensors at the end of a step, differentiable [N, N m].
 
     Args:
         simulator: of the step.
@@ -39,14 +42,18 @@ def readings(
         InputError: a sensor is on nothing that holds or touches the body.
     """
     if sensors and len(simulator.body.coordinates.sliding):
-        raise InputError("a force sensor reads the whole robot, and symmetry planes cut it: simulate all of it.")
+        raise InputError(
+            "a force sensor reads the whole robot, and symmetry planes cut it: simulate all of it."
+        )
     found = list[torch.Tensor]()
     for sensor in sensors:
         stands = isinstance(sensor.at, str) and sensor.at in simulator.energies.obstacle_names
         at = simulator.fixed if sensor.at is None else sensor.at
         with naming("a force sensor: "):
             reaction = simulator.reaction(after, at, before, inputs, constants)
-        found.append(sensor(reaction, None if stands else simulator.rest_positions[reaction.vertices]))
+        found.append(
+            sensor(reaction, None if stands else simulator.rest_positions[reaction.vertices])
+        )
     return torch.stack(found, 1) if found else after.q.new_zeros(after.batch, 0, 6)
 
 
@@ -58,14 +65,20 @@ def later(series: torch.Tensor, delay: torch.Tensor, step: float) -> torch.Tenso
     last = series.shape[1] - 1
     times = step * torch.arange(last + 1).to(delay) + delay[:, None]
     over = times > (last + 1e-6) * step
-    return sample(series, times, step).masked_fill(over.view(*over.shape, *[1] * (series.ndim - 2)), torch.nan)
+    return sample(series, times, step).masked_fill(
+        over.view(*over.shape, *[1] * (series.ndim - 2)), torch.nan
+    )
 
 
-def at_steps(trials: TrialBatch, step: float, delay: torch.Tensor | None = None) -> NDArray[np.float64]:
-    """(R, K + 1, M, 3) markers at the steps of a simulation [m], NaN after a motion's end and in long occlusions.
+def at_steps(
+    trials: TrialBatch, step: float, delay: torch.Tensor | None = None
+) -> NDArray[np.float64]:
+    """(R, K + 1, M, 3) markers at the steps of a simulation [m],
+    NaN after a motion's end and in long occlusions.
 
-    Interpolates with cubic splines through the frames in which a marker was seen, starting from the held position at
-    time zero. A marker counts as not seen at steps that are more than 1.5 frames away from its nearest frame.
+    Interpolates with cubic splines through the frames in which a marker was seen, starting from the
+    held position at time zero. A marker counts as not seen at steps that are more than 1.5 frames
+    away from its nearest frame.
 
     Args:
         trials: observed trials.
@@ -93,10 +106,13 @@ def at_steps(trials: TrialBatch, step: float, delay: torch.Tensor | None = None)
     return positions
 
 
-def loads_at_steps(trials: TrialBatch, step: float, delay: torch.Tensor, count: int) -> torch.Tensor:
+def loads_at_steps(
+    trials: TrialBatch, step: float, delay: torch.Tensor, count: int
+) -> torch.Tensor:
     """(R, count, S, 6) readings at the steps of a simulator [N, N m], linear between frames.
 
-    NaN before and after the frames, and at steps that are more than 1.5 frames away from the nearest reading.
+    NaN before and after the frames, and at steps that are more than 1.5 frames away from the
+    nearest reading.
 
     Args:
         trials: observed trials.

@@ -12,12 +12,13 @@ from ..stepping.state import State
 class Start(Brief):
     """Initial conditions of R trials."""
 
-    state: State  # (R, N, 3) positions [m] and velocities [m/s]; a first guess where the trials begin at rest
-    delay: torch.Tensor  # (R,) between time zero of the frames and the release of the body, or of its inputs [s]
-    # (R, M, 3) true less bound marker places, where a body was held bent but registered as undeformed [m]; None for
-    # no shift
+    state: State  # (R, N, 3) positions [m] and velocities [m/s]; a first guess of those at rest
+    delay: torch.Tensor  # (R,) from time zero of the frames to the release, or the inputs [s]
+    # (R, M, 3) true less bound marker places, where a body was held bent but registered as
+    # undeformed [m]; None for no shift
     shift: torch.Tensor | None = None
-    # whether the bodies begin in equilibrium, which is then solved again for every set of parameters
+    # whether the bodies begin in equilibrium, which is then solved again for every set of
+    # parameters
     at_rest: bool = False
 
     @classmethod
@@ -26,14 +27,18 @@ class Start(Brief):
         return cls(State(guess, torch.zeros_like(guess)), guess.new_zeros(len(guess)), at_rest=True)
 
     def near(self, q: torch.Tensor) -> "Start":
-        """The start with another first guess of its equilibrium [m], (R or E R, N, 3) for E sets of parameters."""
+        """The start with another first guess of its equilibrium [m], (R or E R, N, 3)
+        for E sets of parameters.
+        """
         return replace(self, state=State(q, torch.zeros_like(q)))
 
     def select(self, indices: list[int]) -> "Start":
         """The start of the trials with these indices."""
         pick = torch.as_tensor(indices, device=self.delay.device)
         shift = None if self.shift is None else self.shift[pick]
-        return replace(self, state=self.state.map(lambda t: t[pick]), delay=self.delay[pick], shift=shift)
+        return replace(
+            self, state=self.state.map(lambda t: t[pick]), delay=self.delay[pick], shift=shift
+        )
 
     def shifted(self, markers: torch.Tensor) -> torch.Tensor:
         """(..., R, T, M, 3) true marker positions, from those of bound markers [m]."""

@@ -1,10 +1,11 @@
-r"""Banded Cholesky by LAPACK: the fastest choice for slender bodies on a CPU, up to tens of thousands of unknowns.
+r"""Banded Cholesky by LAPACK: the fastest choice for slender bodies on a CPU,
+up to tens of thousands of unknowns.
 
-The routines are called through ``scipy.linalg.cython_lapack``, which releases the GIL so that other threads can run;
-SciPy's Python wrappers hold it.
+The routines are called through ``scipy.linalg.cython_lapack``, which releases the GIL so that other
+threads can run; SciPy's Python wrappers hold it.
 
-For arrow matrices, the few nodes that couple to many others come last: the control vertices of a rigid part couple to
-every vertex around it and would widen the band to the part's size. In
+For arrow matrices, the few nodes that couple to many others come last: the control vertices of a
+rigid part couple to every vertex around it and would widen the band to the part's size. In
 
     [A  B^T] [x]   [f]
     [B  C  ] [y] = [g],
@@ -13,8 +14,8 @@ A is banded, A^-1 B^T is computed once per factorisation, and S = C - B A^-1 B^T
 
     y = S^-1 (g - B A^-1 f),   x = A^-1 f - A^-1 B^T y.
 
-The matrix is positive definite if and only if A and S are. `tests/linalg/test_linear_solver.py` compares with
-dense factorisations.
+The matrix is positive definite if and only if A and S are. `tests/linalg/test_linear_solver.py`
+compares with dense factorisations.
 """
 
 import ctypes
@@ -26,7 +27,14 @@ import torch
 from scipy.linalg import cython_lapack
 from typing_extensions import override
 
-from .linear_solver import Factor, Indices, LinearSolver, Mask, SeparateFactors, bandwidth_reducing_order
+from .linear_solver import (
+    Factor,
+    Indices,
+    LinearSolver,
+    Mask,
+    SeparateFactors,
+    bandwidth_reducing_order,
+)
 
 _LETTERS = {torch.float64: "d", torch.float32: "s"}
 _HUB = 4.0  # a hub has more than this many times the median number of neighbours
@@ -37,7 +45,10 @@ _MOST_HUBS = 0.1  # share of the nodes
 def _routine(name: str, arguments: int) -> Any:
     capsule = cython_lapack.__pyx_capi__[name]
     api = ctypes.pythonapi
-    api.PyCapsule_GetName.restype, api.PyCapsule_GetName.argtypes = ctypes.c_char_p, [ctypes.py_object]
+    api.PyCapsule_GetName.restype, api.PyCapsule_GetName.argtypes = (
+        ctypes.c_char_p,
+        [ctypes.py_object],
+    )
     api.PyCapsule_GetPointer.restype = ctypes.c_void_p
     api.PyCapsule_GetPointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
     pointer = api.PyCapsule_GetPointer(capsule, api.PyCapsule_GetName(capsule))
@@ -45,7 +56,8 @@ def _routine(name: str, arguments: int) -> Any:
 
 
 class BandedCholesky:
-    """In-place factorisation and solution of matrices (n, w + 1), whose row j has the entries (j, j) to (j + w, j).
+    """In-place factorisation and solution of matrices (n, w + 1),
+    whose row j has the entries (j, j) to (j + w, j).
 
     Args:
         n: number of unknowns.
@@ -56,11 +68,17 @@ class BandedCholesky:
     def __init__(self, n: int, width: int, dtype: torch.dtype) -> None:
         letter = _LETTERS[dtype]
         self._factor, self._solve = _routine(f"{letter}pbtrf", 6), _routine(f"{letter}pbtrs", 9)
-        self._lower, self._numbers = ctypes.c_char(b"L"), [ctypes.c_int(k) for k in (n, width, width + 1)]
+        self._lower, self._numbers = (
+            ctypes.c_char(b"L"),
+            [ctypes.c_int(k) for k in (n, width, width + 1)],
+        )
         self._where = [ctypes.addressof(self._lower), *map(ctypes.addressof, self._numbers)]
 
     def factor(self, matrix: torch.Tensor) -> bool:
-        """Overwrites a contiguous matrix with its factor; returns False if it is not positive definite."""
+        """Overwrites a contiguous matrix with its factor.
+
+        Returns False if it is not positive definite.
+        """
         lower, n, width, rows = self._where
         info = ctypes.c_int()
         self._factor(lower, n, width, matrix.data_ptr(), rows, ctypes.addressof(info))
@@ -74,10 +92,13 @@ class BandedCholesky:
             columns: (n,) or (m, n) right-hand sides of these rows.
         """
         lower, _, width, rows = self._where
-        count, size = ctypes.c_int(1 if columns.ndim == 1 else len(columns)), ctypes.c_int(columns.shape[-1])
+        count = ctypes.c_int(1 if columns.ndim == 1 else len(columns))
+        size = ctypes.c_int(columns.shape[-1])
         n, info = ctypes.addressof(size), ctypes.c_int()
         many, place = ctypes.addressof(count), columns.data_ptr()
-        self._solve(lower, n, width, many, factor.data_ptr(), rows, place, n, ctypes.addressof(info))
+        self._solve(
+            lower, n, width, many, factor.data_ptr(), rows, place, n, ctypes.addressof(info)
+        )
 
 
 class BandedSolver(LinearSolver):
@@ -95,14 +116,18 @@ class BandedSolver(LinearSolver):
         i, j = np.where(swap, j, i), np.where(swap, i, j)
         self.bandwidth = int((i - j).max())
         self.n_values = self.n * (self.bandwidth + 1)
-        self.address = np.where(diagonal_upper, -1, j * (self.bandwidth + 1) + (i - j)).astype(np.int32)
+        self.address = np.where(diagonal_upper, -1, j * (self.bandwidth + 1) + (i - j)).astype(
+            np.int32
+        )
         self.order = order
         self.blocks = _blocks(i, j, self.n)
         self.lapack = BandedCholesky(self.n, self.bandwidth, self.dtype)
 
     @override
     def _factorise(self, values: torch.Tensor, idle: Mask, before: Factor | None) -> Factor:
-        return _Cholesky(self, values.reshape(-1, self.n, self.bandwidth + 1), self._cholesky, idle, before)
+        return _Cholesky(
+            self, values.reshape(-1, self.n, self.bandwidth + 1), self._cholesky, idle, before
+        )
 
     def _cholesky(self, number: int, band: torch.Tensor) -> torch.Tensor | None:
         return band if self.lapack.factor(band) else None
@@ -116,11 +141,14 @@ class _Cholesky(SeparateFactors):
         self._solver.lapack.solve(factor, rows)
 
     @override
-    def _overwrite_units(self, factor: torch.Tensor | None, rows: torch.Tensor, places: torch.Tensor) -> None:
+    def _overwrite_units(
+        self, factor: torch.Tensor | None, rows: torch.Tensor, places: torch.Tensor
+    ) -> None:
         if factor is None or len(self._solver.blocks) == 1:
             super()._overwrite_units(factor, rows, places)
             return
-        for start, end in self._solver.blocks:  # The solution is zero in the blocks of other bodies.
+        # The solution is zero in the blocks of other bodies.
+        for start, end in self._solver.blocks:
             rows_here = ((places >= start) & (places < end)).nonzero().ravel()
             if len(rows_here):
                 columns = rows[rows_here, start:end]
@@ -129,7 +157,7 @@ class _Cholesky(SeparateFactors):
 
 
 def _blocks(i: Indices, j: Indices, n: int) -> list[tuple[int, int]]:
-    """Returns the ranges of unknowns that no entry (i, j) of a matrix couples with others, as first and end."""
+    """Ranges of unknowns that no entry (i, j) of a matrix couples with others, as first and end."""
     reach = np.arange(n)
     np.maximum.at(reach, j.ravel(), i.ravel())
     ends = np.flatnonzero(np.maximum.accumulate(reach) == np.arange(n)) + 1
@@ -137,15 +165,22 @@ def _blocks(i: Indices, j: Indices, n: int) -> list[tuple[int, int]]:
 
 
 def hubs(rows: Indices, cols: Indices, n_nodes: int) -> Indices:
-    """Returns the nodes with many more neighbours than the median, ascending; none if there are too many of them."""
+    """Returns the nodes with many more neighbours than the median, ascending.
+
+    None if there are too many of them.
+    """
     apart = rows != cols
     neighbours = np.bincount(np.concatenate([rows[apart], cols[apart]]), minlength=n_nodes)
     nodes = np.flatnonzero(neighbours > _HUB * max(float(np.median(neighbours)), 1.0))
     return nodes if len(nodes) <= _MOST_HUBS * n_nodes else nodes[:0]
 
 
-def banded_rest(rows: Indices, cols: Indices, n_nodes: int, border: Indices) -> tuple[Indices, Indices, Indices]:
-    """Returns rows and columns of the blocks outside the border, and the new number of each node, -1 in the border."""
+def banded_rest(
+    rows: Indices, cols: Indices, n_nodes: int, border: Indices
+) -> tuple[Indices, Indices, Indices]:
+    """Returns rows and columns of the blocks outside the border,
+    and the new number of each node, -1 in the border.
+    """
     inside = np.ones(n_nodes, dtype=bool)
     inside[border] = False
     number = np.where(inside, np.cumsum(inside) - 1, -1)
@@ -154,13 +189,18 @@ def banded_rest(rows: Indices, cols: Indices, n_nodes: int, border: Indices) -> 
 
 
 class BorderedSolver(LinearSolver):
-    """Banded Cholesky of all nodes but `hubs`, and a dense Schur complement for these; on the CPU."""
+    """Banded Cholesky of all nodes but `hubs`, and a dense Schur complement for these.
+
+    On the CPU.
+    """
 
     @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
         border = hubs(rows, cols, n_nodes)
         band_rows, band_cols, number = banded_rest(rows, cols, n_nodes, border)
-        self.band = BandedSolver(band_rows, band_cols, n_nodes - len(border), self.block, self.device, self.dtype)
+        self.band = BandedSolver(
+            band_rows, band_cols, n_nodes - len(border), self.block, self.device, self.dtype
+        )
         k, n = self.block, self.n
         place = np.full(n_nodes, -1)
         place[border] = np.arange(len(border))
@@ -170,7 +210,10 @@ class BorderedSolver(LinearSolver):
         self.address[kept] = self.band.address
         r, c = self._entries(rows[~kept], cols[~kept])
         below = (place[rows[~kept]] >= 0)[:, None]
-        hub = np.where(below, place[rows[~kept]][:, None], place[cols[~kept]][:, None]) * k + np.where(below, r, c) % k
+        hub = (
+            np.where(below, place[rows[~kept]][:, None], place[cols[~kept]][:, None]) * k
+            + np.where(below, r, c) % k
+        )
         place = self.band.n_values + hub * n + np.where(below, c, r)
         self.address[~kept] = np.where((rows == cols)[~kept, None] & (r < c), -1, place)
         self.n_values = self.band.n_values + len(border) * k * n
@@ -186,7 +229,9 @@ class BorderedSolver(LinearSolver):
         cross, corner = arrow[..., : self.band_size].mT, arrow[..., self.band_size :].tril()
         corner = corner + corner.tril(-1).mT
         kept = before if isinstance(before, _Bordered) else None
-        inner = self.band.factor(banded.clone(), idle=idle, before=None if kept is None else kept.inner)
+        inner = self.band.factor(
+            banded.clone(), idle=idle, before=None if kept is None else kept.inner
+        )
         return _Bordered(self, inner, cross, corner, idle, kept)
 
 

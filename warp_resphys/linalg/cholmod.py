@@ -1,4 +1,6 @@
-"""Sparse Cholesky by CHOLMOD or SuperLU, one environment at a time: for wide bands where there is no Pardiso."""
+"""Sparse Cholesky by CHOLMOD or SuperLU, one environment at a time:
+for wide bands where there is no Pardiso.
+"""
 
 import ctypes
 import os
@@ -32,7 +34,9 @@ class SparseSolver(LinearSolver):
         self.keeps_factors = self.device.type == "cpu"
         i, j = self._entries(rows, cols)
         keep = ~((rows == cols)[:, None] & (i < j))
-        self.address = np.where(keep, (np.cumsum(keep) - 1).reshape(keep.shape), -1).astype(np.int32)
+        self.address = np.where(keep, (np.cumsum(keep) - 1).reshape(keep.shape), -1).astype(
+            np.int32
+        )
         self.n_values = int(keep.sum())
 
     @override
@@ -54,7 +58,9 @@ class SparseSolver(LinearSolver):
         entries = values.detach().double()[place]
         try:
             with _without_warnings():
-                return cholespy.CholeskySolverD(self.n, row.int(), column.int(), entries, cholespy.MatrixType.COO)
+                return cholespy.CholeskySolverD(
+                    self.n, row.int(), column.int(), entries, cholespy.MatrixType.COO
+                )
         except (ValueError, RuntimeError):
             return None
 
@@ -77,10 +83,12 @@ class _Cholmod(SeparateFactors):
 
 @contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Leaves out warnings that CHOLMOD prints by C, for which cholespy has no option; other output comes at the end.
+    """Leaves out warnings that CHOLMOD prints by C, for which cholespy has no option.
 
-    Processes that are started meanwhile lose their output. On Windows, whose C libraries do not share their buffers,
-    nothing is left out.
+    Other output comes at the end.
+
+    Processes that are started meanwhile lose their output. On Windows, whose C libraries do not
+    share their buffers, nothing is left out.
     """
     if os.name == "nt":
         yield

@@ -26,8 +26,8 @@ def conjugate_gradients(
 ) -> Iterate:
     """Solves a batch of symmetric positive definite systems.
 
-    A system stops at the first direction of non-positive curvature and returns the iterate before it (Steihaug 1983),
-    or the preconditioned right-hand side if that is the first direction.
+    A system stops at the first direction of non-positive curvature and returns the iterate before
+    it (Steihaug 1983), or the preconditioned right-hand side if that is the first direction.
 
     Args:
         operator: maps (B, ...) to (B, ...).
@@ -35,7 +35,8 @@ def conjugate_gradients(
         right: (B, ...) right-hand sides.
         tolerance: relative, in the preconditioner's norm.
         max_iterations: limit after which the last iterate is returned.
-        shortest: largest entry of the preconditioned residual below which a system is solved as well.
+        shortest: largest entry of the preconditioned residual below which a system is solved as
+            well.
     """
 
     def dot(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Factors of matrices with dense couplings between a few unknowns, from the factors without these."""
+"""Factors of matrices with dense couplings between a few unknowns, from factors without these."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,8 @@ class Coupling:
 
     Attributes:
         environments: (G,) environments.
-        unknowns: (G, m) their unknowns; -1 in places that an environment does not need, where K is zero.
+        unknowns: (G, m) their unknowns; -1 in places that an environment does not need, where K is
+            zero.
         matrices: (G, m, m) K.
     """
 
@@ -28,16 +29,20 @@ class Coupling:
         On a CPU, a product of one matrix and one of several are not the same in every bit.
         """
         size = 1 if self.matrices.device.type == "cpu" else len(self.matrices)
-        yield from zip(*(x.split(size) for x in (self.environments, self.unknowns, self.matrices)), strict=True)
+        yield from zip(
+            *(x.split(size) for x in (self.environments, self.unknowns, self.matrices)), strict=True
+        )
 
 
 class VertexCouplings:
-    """Turns couplings of vertices, some of which are weighted sums of free ones, into those of the free ones.
+    """Turns couplings of vertices, some of which are weighted sums of free ones,
+    into those of the free ones.
 
     The matrix of all vertices in contact is made first, and then W^T K W.
 
     Args:
-        columns: (V, w) free vertices that determine every vertex; -1 in places that it does not need.
+        columns: (V, w) free vertices that determine every vertex; -1 in places that it does not
+            need.
         weights: (V, w) their weights.
     """
 
@@ -45,7 +50,9 @@ class VertexCouplings:
         self._columns, self._weights = columns, weights
         self._count = int(columns.max()) + 1
 
-    def reduced(self, environments: torch.Tensor, vertices: torch.Tensor, matrices: torch.Tensor) -> Iterator[Coupling]:
+    def reduced(
+        self, environments: torch.Tensor, vertices: torch.Tensor, matrices: torch.Tensor
+    ) -> Iterator[Coupling]:
         """Yields the couplings of free vertices.
 
         Args:
@@ -64,7 +71,8 @@ class VertexCouplings:
             unknowns = torch.full((len(some), int(counts.max())), -1, device=some.device)
             unknowns[keys // self._count, at] = keys % self._count
             weights = k.new_zeros(*chosen.shape, unknowns.shape[1])
-            vertex = torch.arange(chosen.shape[1], device=some.device)[:, None].expand_as(columns)[used]
+            vertex = torch.arange(chosen.shape[1], device=some.device)[:, None].expand_as(columns)
+            vertex = vertex[used]
             weights[row[used], vertex, at[local]] = self._weights[chosen][used].to(k)
             whole = k.unflatten(2, (-1, 3)).unflatten(1, (-1, 3))
             reduced = torch.einsum("gsi,gsxty,gtj->gixjy", weights, whole, weights)
@@ -78,9 +86,11 @@ def coordinates(vertices: torch.Tensor) -> torch.Tensor:
 
 
 class CouplingSolver:
-    """Solves (A + E K E^T) x = r with a factor of A (Woodbury), where E selects the unknowns of a coupling.
+    """Solves (A + E K E^T) x = r with a factor of A (Woodbury),
+    where E selects the unknowns of a coupling.
 
-    The solutions S = A^-1 E are kept as long as the factor, so that other matrices K cost only dense algebra.
+    The solutions S = A^-1 E are kept as long as the factor, so that other matrices K cost only
+    dense algebra.
 
     Args:
         batch: number of environments B.
@@ -90,7 +100,8 @@ class CouplingSolver:
 
     def __init__(self, batch: int, n: int, like: torch.Tensor) -> None:
         device = like.device
-        self._places = torch.full((batch, n), -1, device=device)  # column of every unknown in S, or -1
+        # Column of every unknown in S, or -1.
+        self._places = torch.full((batch, n), -1, device=device)
         self._counts = torch.zeros(batch, device=device, dtype=torch.int64)  # columns of S
         self._solved = like.new_zeros(batch, 0, n)  # columns of S as rows
 
@@ -104,7 +115,9 @@ class CouplingSolver:
             self._places.masked_fill_(~kept[:, None], -1)
             self._counts.masked_fill_(~kept, 0)
 
-    def correct(self, factor: Factor, couplings: Sequence[Coupling], x: torch.Tensor, order: torch.Tensor) -> None:
+    def correct(
+        self, factor: Factor, couplings: Sequence[Coupling], x: torch.Tensor, order: torch.Tensor
+    ) -> None:
         """Turns solutions for A into those with couplings.
 
         Args:
@@ -118,7 +131,8 @@ class CouplingSolver:
         place[order] = torch.arange(len(order), device=order.device)
         for b, unknowns, k in (part for coupling in couplings for part in coupling.parts()):
             used = unknowns.clamp_min(0)  # K is zero where there is none
-            solved = self._solved[b[:, None], self._places[b[:, None], used].clamp_min(0)]  # (G, m, n)
+            # (G, m, n)
+            solved = self._solved[b[:, None], self._places[b[:, None], used].clamp_min(0)]
             among = solved.gather(2, used[:, None].expand(-1, used.shape[1], -1)).to(k)
             small = torch.eye(used.shape[1], device=x.device, dtype=k.dtype) + k @ among
             along = torch.linalg.solve(small, k @ x[b[:, None], place[used]].to(k)).to(x)
@@ -138,7 +152,9 @@ class CouplingSolver:
         self._counts += new
         spare = int(self._counts.max()) - self._solved.shape[1]
         if spare > 0:
-            more = self._solved.new_zeros(len(self._counts), spare + spare // 2, self._solved.shape[2])
+            more = self._solved.new_zeros(
+                len(self._counts), spare + spare // 2, self._solved.shape[2]
+            )
             self._solved = torch.cat([self._solved, more], 1)
         self._places[rows, unknowns] = at
         self._solved[rows, at] = factor.inverse_columns(rows, unknowns, self._solved)

@@ -1,7 +1,8 @@
 """Interface of the solvers of symmetric linear systems, for a batch of bodies.
 
-A solver is built once per sparsity pattern. Its ``address`` maps each matrix entry to a place in the value array, so
-that one Warp kernel assembles for every layout. ``factor`` turns a batch of value arrays into a `Factor`.
+A solver is built once per sparsity pattern. Its ``address`` maps each matrix entry to a place in
+the value array, so that one Warp kernel assembles for every layout. ``factor`` turns a batch of
+value arrays into a `Factor`.
 """
 
 from abc import ABC, abstractmethod
@@ -29,20 +30,26 @@ class Factor(ABC):
     """A factorised batch of matrices.
 
     Attributes:
-        failed: (B,) bool; matrices without a factor because they are not positive definite; their solutions are NaN.
+        failed: (B,) bool; matrices without a factor because they are not positive definite; their
+            solutions are NaN.
     """
 
     failed: NDArray[np.bool_]
 
     @abstractmethod
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
-        """Returns the solutions for (B, n, m) right-hand sides; a factor of batch 1 applies to every environment."""
+        """Returns the solutions for (B, n, m) right-hand sides.
+
+        A factor of batch 1 applies to every environment.
+        """
 
     def solve_in_place(self, columns: torch.Tensor) -> None:
-        """Overwrites (B, n) right-hand sides, in the solver's order of unknowns, with the solutions."""
+        """Overwrites (B, n) right-hand sides, in the solver's order of unknowns, with solutions."""
         columns.copy_(self.solve(columns[:, :, None])[:, :, 0])
 
-    def inverse_columns(self, environments: torch.Tensor, unknowns: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    def inverse_columns(
+        self, environments: torch.Tensor, unknowns: torch.Tensor, like: torch.Tensor
+    ) -> torch.Tensor:
         """Returns columns (k, n) of the inverses.
 
         Args:
@@ -69,7 +76,10 @@ class CorrectedFactor(Factor):
         self.factor, self.columns, self._order = factor, columns, order
         self.failed = factor.failed
         self._solved = factor.solve(columns)
-        small = torch.eye(columns.shape[2], device=columns.device, dtype=columns.dtype) + columns.mT @ self._solved
+        small = (
+            torch.eye(columns.shape[2], device=columns.device, dtype=columns.dtype)
+            + columns.mT @ self._solved
+        )
         self._small = torch.linalg.lu_factor_ex(small)[:2]
 
     @override
@@ -81,7 +91,9 @@ class CorrectedFactor(Factor):
     def solve_in_place(self, columns: torch.Tensor) -> None:
         self.factor.solve_in_place(columns)
         along = self.columns[:, self._order].mT @ columns[:, :, None]
-        columns -= (self._solved[:, self._order] @ torch.linalg.lu_solve(*self._small, along))[:, :, 0]
+        columns -= (self._solved[:, self._order] @ torch.linalg.lu_solve(*self._small, along))[
+            :, :, 0
+        ]
 
 
 class PivotedFactor(Factor):
@@ -161,23 +173,33 @@ class SeparateFactors(Factor):
     @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
         b, n, m = rhs.shape
-        rows = rhs[:, self._solver.dofs].mT.reshape((1, b * m, n) if len(self.factors) == 1 else (b, m, n))
+        rows = rhs[:, self._solver.dofs].mT.reshape(
+            (1, b * m, n) if len(self.factors) == 1 else (b, m, n)
+        )
         rows = rows.contiguous()
         self._overwrite_all(rows)
         return rows.view(b, m, n).mT[:, self._solver.places]
 
     @override
-    def inverse_columns(self, environments: torch.Tensor, unknowns: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    def inverse_columns(
+        self, environments: torch.Tensor, unknowns: torch.Tensor, like: torch.Tensor
+    ) -> torch.Tensor:
         out, place = like.new_zeros(len(unknowns), like.shape[2]), self._solver.places[unknowns]
         out[torch.arange(len(out), device=out.device), place] = 1.0
-        for environment, count in zip(*(x.tolist() for x in environments.unique(return_counts=True)), strict=True):
+        for environment, count in zip(
+            *(x.tolist() for x in environments.unique(return_counts=True)), strict=True
+        ):
             first = int(torch.searchsorted(environments, environment))
             number = environment if len(self.factors) > 1 else 0
-            self._overwrite_units(self.factors[number], out[first : first + count], place[first : first + count])
+            self._overwrite_units(
+                self.factors[number], out[first : first + count], place[first : first + count]
+            )
         return out[:, self._solver.places]
 
     def _overwrite_units(self, factor: Any, rows: torch.Tensor, places: torch.Tensor) -> None:
-        """Overwrites right-hand sides (m, n) that are zero but for a one at a place (m,) with the solutions."""
+        """Overwrites right-hand sides (m, n) that are zero
+        but for a one at a place (m,) with the solutions.
+        """
         if factor is None:
             rows.fill_(torch.nan)
         else:
@@ -206,7 +228,8 @@ class LinearSolver(ABC):
         address: (E, block^2) place of each block entry in the value array, -1 if not stored.
         n_values: length of the value array.
         overwrites: whether `factor` overwrites the values.
-        keeps_factors: whether a factor takes as long as dozens of solutions, so that it is kept for many states.
+        keeps_factors: whether a factor takes as long as dozens of solutions, so that it is kept for
+            many states.
         order: (n_nodes,) nodes in the order of the right-hand sides of `Factor.solve_in_place`.
     """
 
@@ -217,7 +240,13 @@ class LinearSolver(ABC):
     keeps_factors = False
 
     def __init__(
-        self, rows: Indices, cols: Indices, n_nodes: int, block: int, device: torch.device, dtype: torch.dtype
+        self,
+        rows: Indices,
+        cols: Indices,
+        n_nodes: int,
+        block: int,
+        device: torch.device,
+        dtype: torch.dtype,
     ) -> None:
         self._pattern = rows, cols
         self.n = n_nodes * block
@@ -228,8 +257,9 @@ class LinearSolver(ABC):
         self._lay_out(rows, cols, n_nodes)
         if self.n_values > _MOST_VALUES:
             raise InputError(
-                f"a {type(self).__name__} for {self.n} unknowns needs {self.n_values:.1e} numbers, beyond the "
-                f"{_MOST_VALUES:.1e} that a kernel addresses: choose solver.linear_solver=sparse."
+                f"a {type(self).__name__} for {self.n} unknowns needs {self.n_values:.1e} "
+                f"numbers, beyond the {_MOST_VALUES:.1e} that a kernel addresses: choose "
+                "solver.linear_solver=sparse."
             )
 
     @abstractmethod
@@ -246,9 +276,11 @@ class LinearSolver(ABC):
         """Factorises positive definite matrices A, or A + C C^T; others are reported in ``failed``.
 
         Args:
-            values: (B, n_values) entries at the solver's addresses, zero elsewhere; see `overwrites`.
+            values: (B, n_values) entries at the solver's addresses, zero elsewhere; see
+                `overwrites`.
             columns: (B, n, r) C.
-            idle: (B,) matrices that keep their previous factor; without one, their solutions are undefined.
+            idle: (B,) matrices that keep their previous factor; without one, their solutions are
+                undefined.
             before: the previous factor, which must not be used any more.
         """
         kept = before if idle is not None else None
@@ -266,10 +298,14 @@ class LinearSolver(ABC):
         idle: torch.Tensor | None = None,
         before: Factor | None = None,
     ) -> Factor:
-        """Returns a factor like `factor`, for directions and preconditioning: in float32 where that is faster."""
+        """Returns a factor like `factor`, for directions and preconditioning:
+        in float32 where that is faster.
+        """
         return self.factor(values, columns, idle, before)
 
-    def pivoted(self, values: torch.Tensor, factor: Factor, columns: torch.Tensor | None = None) -> Factor:
+    def pivoted(
+        self, values: torch.Tensor, factor: Factor, columns: torch.Tensor | None = None
+    ) -> Factor:
         """Returns a factor of any regular matrices, from one that has failed for some of them.
 
         Args:
@@ -277,7 +313,9 @@ class LinearSolver(ABC):
             factor: the factor of these.
             columns: (B, n, r) C.
         """
-        whole = PivotedFactor(self, factor.factor if isinstance(factor, CorrectedFactor) else factor, values)
+        whole = PivotedFactor(
+            self, factor.factor if isinstance(factor, CorrectedFactor) else factor, values
+        )
         return whole if columns is None else CorrectedFactor(whole, columns, self.dofs)
 
     @cached_property
@@ -329,7 +367,8 @@ def sparse_lu(matrix: scipy.sparse.csc_array, definite: bool) -> Any:
         diag_pivot_thresh=0.0 if definite else 1.0,
         options={"SymmetricMode": definite},
     )
-    # Without pivoting, a symmetric matrix is positive definite if and only if all pivots are positive.
+    # Without pivoting, a symmetric matrix is positive definite if and only if all pivots are
+    # positive.
     if definite and not (lu.U.diagonal() > 0).all():
         raise ValueError("a pivot is not positive")
     return lu
@@ -343,7 +382,9 @@ def numbered(groups: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Tens
         count: number of groups.
     """
     sizes = torch.bincount(groups, minlength=count)
-    return sizes, torch.arange(len(groups), device=groups.device) - (sizes.cumsum(0) - sizes)[groups]
+    return sizes, torch.arange(len(groups), device=groups.device) - (sizes.cumsum(0) - sizes)[
+        groups
+    ]
 
 
 def bandwidth(rows: Indices, cols: Indices, n_nodes: int) -> int:
@@ -353,10 +394,16 @@ def bandwidth(rows: Indices, cols: Indices, n_nodes: int) -> int:
 
 
 def bandwidth_reducing_order(rows: Indices, cols: Indices, n_nodes: int) -> Indices:
-    """Returns nodes (n_nodes,) in reverse Cuthill-McKee order, or in the given order if its band is not wider."""
+    """Returns nodes (n_nodes,) in reverse Cuthill-McKee order,
+    or in the given order if its band is not wider.
+    """
     i, j = np.concatenate([rows, cols]), np.concatenate([cols, rows])
-    graph = scipy.sparse.csr_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(n_nodes, n_nodes))
-    order = scipy.sparse.csgraph.reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True).astype(np.int64)
+    graph = scipy.sparse.csr_array(
+        (np.ones(len(i), dtype=np.int8), (i, j)), shape=(n_nodes, n_nodes)
+    )
+    order = scipy.sparse.csgraph.reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True).astype(
+        np.int64
+    )
     place = np.argsort(order)
     if np.abs(place[rows] - place[cols]).max(initial=0) < np.abs(rows - cols).max(initial=0):
         return order

@@ -1,4 +1,6 @@
-"""Sparse Cholesky by Pardiso, for compact bodies on x86 processors, with one analysis for many factors."""
+"""Sparse Cholesky by Pardiso, for compact bodies on x86 processors,
+with one analysis for many factors.
+"""
 
 import ctypes
 import importlib.metadata
@@ -25,8 +27,9 @@ Values = NDArray[np.floating[Any]]
 class PardisoSolver(LinearSolver):
     """Pardiso (Schenk and Gaertner 2004) of Intel's oneMKL, in an order by nested dissection.
 
-    A factor costs as much as some fifty solutions, and the analysis of the pattern, made once, a third of it: factors
-    are kept for long. A solution takes as long as reading the factor from memory, and half as long in single precision.
+    A factor costs as much as some fifty solutions, and the analysis of the pattern, made once, a
+    third of it: factors are kept for long. A solution takes as long as reading the factor from
+    memory, and half as long in single precision.
     """
 
     keeps_factors = True
@@ -41,9 +44,11 @@ class PardisoSolver(LinearSolver):
         self.address[keep] = np.argsort(order)
         self.n_values = len(order)
         starts = np.searchsorted(row[order], np.arange(self.n + 1))
-        self._rows = (starts.astype(np.int32), column[order].astype(np.int32))  # CSR of the upper triangle
+        # CSR of the upper triangle
+        self._rows = (starts.astype(np.int32), column[order].astype(np.int32))
         self._rooms: dict[tuple[object, ...], _Room] = {}
-        self._needs_double: set[tuple[int, int]] = set()  # environments that once had no factor in float32
+        # Environments that once had no factor in float32.
+        self._needs_double: set[tuple[int, int]] = set()
 
     @override
     def _factorise(self, values: torch.Tensor, idle: Mask, before: Factor | None) -> Factor:
@@ -130,10 +135,12 @@ class _Room:
 
     def __init__(self, pattern: tuple[NDArray[np.int32], ...], values: Values) -> None:
         self._pattern, self.stamp = pattern, 0
-        self._threads = torch.get_num_threads()  # A factor by another number than the analysis may crash.
+        # A factor by another number than the analysis may crash.
+        self._threads = torch.get_num_threads()
         self._internal, self._options = np.zeros(64, dtype=np.int64), np.zeros(64, dtype=np.int32)
-        # Own options; METIS; solutions overwrite; pivots; precision; from zero. Threads on two levels (23) gave wrong
-        # factors without an error up to oneMKL 2026.0, where one replaced another.
+        # Own options; METIS; solutions overwrite; pivots; precision; from zero. Threads on two
+        # levels (23) gave wrong factors without an error up to oneMKL 2026.0, where one replaced
+        # another.
         options = {0: 1, 1: 2, 5: 1, 9: 8, 27: values.dtype == np.float32, 34: 1}
         for place, value in options.items():
             self._options[place] = value
@@ -144,7 +151,9 @@ class _Room:
             self.call(_RELEASE)
 
     def factorise(self, values: Values) -> bool:
-        """Returns whether the matrix of values (n_values,) has a factor, without a pivot that was made larger."""
+        """Returns whether the matrix of values (n_values,) has a factor,
+        without a pivot that was made larger.
+        """
         self.stamp += 1
         finite = np.isfinite(values.sum())
         return bool(finite and self.call(_FACTOR, values) == 0 and self._options[_PERTURBED] == 0)
@@ -164,7 +173,9 @@ class _Room:
         unknowns, error = len(self._pattern[0]) - 1, ctypes.c_int32(0)
         count = 1 if right is None else right.size // unknowns
         room = None if right is None else np.empty_like(right)
-        *head, sides, silent = (ctypes.byref(ctypes.c_int32(n)) for n in (1, 1, _DEFINITE, phase, unknowns, count, 0))
+        *head, sides, silent = (
+            ctypes.byref(ctypes.c_int32(n)) for n in (1, 1, _DEFINITE, phase, unknowns, count, 0)
+        )
         arrays = [self._internal, values, *self._pattern, self._options, right, room]
         internal, matrix, starts, columns, options, rhs, solution = (
             None if array is None else array.ctypes.data_as(ctypes.c_void_p) for array in arrays
@@ -175,7 +186,10 @@ class _Room:
         library.pardiso(internal, *head, matrix, starts, columns, None, sides, *outcome)
         library.MKL_Set_Num_Threads_Local(0)
         if error.value == _NO_MEMORY:
-            raise MemoryError(f"a factor of {unknowns} unknowns needs more memory than there is: take larger cells.")
+            raise MemoryError(
+                f"a factor of {unknowns} unknowns needs more memory "
+                "than there is: take larger cells."
+            )
         if error.value and phase != _FACTOR:
             raise RuntimeError(f"Pardiso fails with error {error.value} in phase {phase}.")
         return error.value
@@ -193,7 +207,8 @@ def mkl() -> Any:
         path = next(file for file in files if file.name.startswith(("libmkl_rt", "mkl_rt")))
     except (importlib.metadata.PackageNotFoundError, StopIteration):
         raise ModuleNotFoundError("the package mkl is not installed") from None
-    os.environ.setdefault("KMP_BLOCKTIME", "0")  # Idle threads of its OpenMP would take cores from others.
+    # Idle threads of its OpenMP would take cores from others.
+    os.environ.setdefault("KMP_BLOCKTIME", "0")
     return ctypes.CDLL(str(path.locate()))
 
 

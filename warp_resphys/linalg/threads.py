@@ -24,10 +24,11 @@ _IN_CACHE = 4_000  # unknowns of the environments of a shard
 
 @contextmanager
 def threads_for(unknowns: int, shards: int = 1) -> Iterator[None]:
-    """Limits BLAS to one thread, and torch too for small bodies (`unknowns`) or for a batch split into shards.
+    """Limits BLAS to one thread, and torch too for small bodies (`unknowns`)
+    or for a batch split into shards.
 
-    Threads that spin-wait for microseconds of work cost milliseconds when the cores are busy, and a banded factor gains
-    nothing from a second thread.
+    Threads that spin-wait for microseconds of work cost milliseconds when the cores are busy, and a
+    banded factor gains nothing from a second thread.
     """
     before, outer = torch.get_num_threads(), getattr(_OF_THREAD, "unlimited", None)
     limit_torch = before > 1 and not (unknowns >= _WORTH_SHARING and shards == 1)
@@ -45,7 +46,9 @@ def threads_for(unknowns: int, shards: int = 1) -> Iterator[None]:
 
 
 class _BlasLimit:
-    """Limit of BLAS to one thread, which all threads of the process share: the last user takes it away."""
+    """Limit of BLAS to one thread, which all threads of the process share:
+    the last user takes it away.
+    """
 
     def __init__(self) -> None:
         self._lock, self._users, self._limited = Lock(), 0, list[tuple[LibController, int]]()
@@ -53,7 +56,8 @@ class _BlasLimit:
     def begin(self) -> None:
         with self._lock:
             if not self._users:
-                # Direct calls to the libraries: threadpoolctl's own queries take too long for a time step.
+                # Direct calls to the libraries: threadpoolctl's own queries take too long for a
+                # time step.
                 counts = [(library, library.get_num_threads()) for library in _blas()]
                 self._limited = [(library, count) for library, count in counts if count != 1]
                 for library, _ in self._limited:
@@ -77,10 +81,13 @@ def _blas() -> list[LibController]:
 
 
 def shards_of(batch: int, device: torch.device, unknowns: int = 1) -> list[slice]:
-    """Returns the slices of a batch that are worked on one after another or by several threads; none for a single one.
+    """Returns the slices of a batch that are worked on one after another or by several threads.
 
-    On a CPU a kernel runs on the thread that launches it and releases the GIL. There is a slice for each thread, or
-    more for large environments, whose matrices then stay in a processor's cache from one kernel to the next.
+    None for a single one.
+
+    On a CPU a kernel runs on the thread that launches it and releases the GIL. There is a slice for
+    each thread, or more for large environments, whose matrices then stay in a processor's cache
+    from one kernel to the next.
 
     Args:
         batch: number of environments.
@@ -101,7 +108,8 @@ def shards_of(batch: int, device: torch.device, unknowns: int = 1) -> list[slice
 
 
 def thread_count() -> int:
-    """Returns the number of threads that share a batch: torch's outside `threads_for`, or ``WARP_RESPHYS_THREADS``.
+    """Returns the number of threads that share a batch: torch's outside `threads_for`, or
+    ``WARP_RESPHYS_THREADS``.
 
     Raises:
         InputError: the environment variable is not a whole number.
@@ -109,11 +117,14 @@ def thread_count() -> int:
     unlimited = getattr(_OF_THREAD, "unlimited", None) or torch.get_num_threads()
     threads = os.environ.get("WARP_RESPHYS_THREADS", str(unlimited))
     if not threads.isdecimal():
-        raise InputError(f"WARP_RESPHYS_THREADS is {threads!r}: it must be a whole number of threads.")
+        raise InputError(
+            f"WARP_RESPHYS_THREADS is {threads!r}: it must be a whole number of threads."
+        )
     return max(1, int(threads))
 
 
-# Of each thread: whether it is `sharing`, at work on one of several shards, and torch's `unlimited` number of threads.
+# Of each thread: whether it is `sharing`, at work on one of several shards, and torch's `unlimited`
+# number of threads.
 _OF_THREAD = local()
 
 
@@ -140,8 +151,8 @@ if hasattr(os, "register_at_fork"):
 def in_threads(work: Callable[[S], T], shards: Sequence[S]) -> list[T]:
     """Returns the results of a function for all shards, of which every thread works on some.
 
-    The calling thread is the last one. Exceptions are raised after all threads have finished. Within the function,
-    further shards are not shared again.
+    The calling thread is the last one. Exceptions are raised after all threads have finished.
+    Within the function, further shards are not shared again.
     """
     threads = min(thread_count(), len(shards))
     if threads == 1 or is_shared():

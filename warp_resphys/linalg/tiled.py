@@ -1,4 +1,6 @@
-"""Tiled banded Cholesky: for batches of slender bodies on a GPU, one block of threads per matrix."""
+"""Tiled banded Cholesky: for batches of slender bodies on a GPU,
+one block of threads per matrix.
+"""
 
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +17,9 @@ from .linear_solver import Factor, Indices, LinearSolver, Mask, bandwidth_reduci
 
 
 class TiledSolver(LinearSolver):
-    """Banded Cholesky in tiles (``kernels.tiled_cholesky``), in reverse Cuthill-McKee order, on any device."""
+    """Banded Cholesky in tiles (``kernels.tiled_cholesky``),
+    in reverse Cuthill-McKee order, on any device.
+    """
 
     overwrites = True
 
@@ -30,12 +34,17 @@ class TiledSolver(LinearSolver):
         tiles, columns = -(-self.n // TILE), (self.width + 1) * TILE
         self.shape = (tiles * TILE, columns)
         self.n_values = tiles * TILE * columns
-        self.address = np.where(upper, -1, i * columns + (j // TILE - i // TILE + self.width) * TILE + j % TILE)
+        self.address = np.where(
+            upper, -1, i * columns + (j // TILE - i // TILE + self.width) * TILE + j % TILE
+        )
         self.address = self.address.astype(np.int32)
         rest = np.arange(self.n, tiles * TILE)
-        self._padding = torch.as_tensor(rest * columns + self.width * TILE + rest % TILE, device=self.device)
+        self._padding = torch.as_tensor(
+            rest * columns + self.width * TILE + rest % TILE, device=self.device
+        )
         self._diagonal = torch.as_tensor(
-            np.arange(self.n) * columns + self.width * TILE + np.arange(self.n) % TILE, device=self.device
+            np.arange(self.n) * columns + self.width * TILE + np.arange(self.n) % TILE,
+            device=self.device,
         )
         self.scalar = wp.float64 if self.dtype == torch.float64 else wp.float32
         self.kernels = tiled_kernels(self.scalar)
@@ -62,14 +71,21 @@ class TiledSolver(LinearSolver):
         views = [wp.from_torch(array, requires_grad=False) for array in arrays]
         options = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
         with shareable():
-            return RecordedLaunch(wp.launch_tiled(kernel, dim=list(blocks), inputs=views, **options))
+            return RecordedLaunch(
+                wp.launch_tiled(kernel, dim=list(blocks), inputs=views, **options)
+            )
 
-    def record_factor(self, values: torch.Tensor, active: torch.Tensor, clamped: torch.Tensor) -> SimpleNamespace:
-        """Returns recorded launches of ``clear``, ``factor`` and ``check`` (``kernels.tiled_cholesky``).
+    def record_factor(
+        self, values: torch.Tensor, active: torch.Tensor, clamped: torch.Tensor
+    ) -> SimpleNamespace:
+        """Returns recorded launches of ``clear``, ``factor`` and ``check``
+        (``kernels.tiled_cholesky``).
 
         Args:
-            values: (B, n_values), assembled between ``clear`` and ``factor``, overwritten by the factors.
-            active: (B,) zero for matrices to skip; ``check`` leaves one only where an unclamped matrix failed.
+            values: (B, n_values), assembled between ``clear`` and ``factor``, overwritten by the
+                factors.
+            active: (B,) zero for matrices to skip; ``check`` leaves one only where an unclamped
+                matrix failed.
             clamped: (B,) matrices with clamped eigenvalues; their factors are NaN if they fail.
         """
         batch, unit = len(values), torch.zeros(self.n_values, device=self.device, dtype=self.dtype)
@@ -82,8 +98,12 @@ class TiledSolver(LinearSolver):
         )
 
     def record_solve(self, factors: torch.Tensor, columns: torch.Tensor) -> Any:
-        """Returns the recorded launch that overwrites (B, n) right-hand sides, in the solver's order."""
-        return self._record(self.kernels.solve, (len(columns), 1), factors.view(-1, *self.shape), columns[:, None])
+        """Returns the recorded launch that overwrites (B, n) right-hand sides,
+        in the solver's order.
+        """
+        return self._record(
+            self.kernels.solve, (len(columns), 1), factors.view(-1, *self.shape), columns[:, None]
+        )
 
 
 class _TiledFactor(Factor):

@@ -16,22 +16,27 @@ from ..kernels.modules import shareable
 from .elements import FACES, Rule, Shape
 from .volume_mesh import Mesh, boundary_faces, boundary_triangles, connected_parts, face_triangles
 
-_SAME_HEIGHT = 0.05  # chambers with centres closer than this along the axis, over the body's length, are side by side
+# Chambers with centres closer than this along the axis, over the body's length, are side by side.
+_SAME_HEIGHT = 0.05
 _DIRECTIONS = 24  # rays per triangle, over the hemisphere of its normal
 _HIDDEN = 0.2  # fraction of unobstructed rays below which a triangle is inside a cavity
 _LEAST_AREA = 0.01  # smallest area of a cavity, over that of the outer surface
-_LIFT = 1e-5  # distance of a ray's start from the surface, over the diagonal of the mesh; beyond float32's rounding
+# Distance of a ray's start from the surface, over the diagonal of the mesh; beyond float32's
+# rounding.
+_LIFT = 1e-5
 
 ensure_kernel_cache()  # before Warp is first used
 
 
 @dataclass(frozen=True, eq=False)
 class Chamber:
-    """A surface under pressure: a closed one inside a body (`find_chambers`), or open faces (`select_faces`)."""
+    """A surface under pressure: a closed one inside a body (`find_chambers`),
+    or open faces (`select_faces`).
+    """
 
     name: str  # name in results and messages
-    # (F, 3 | 4 | 6 | 8 | 9) vertices of the faces as from `boundary_faces`, counter-clockwise seen from outside the
-    # solid, that is, from the side of the pressure
+    # (F, 3 | 4 | 6 | 8 | 9) vertices of the faces as from `boundary_faces`, counter-clockwise seen
+    # from outside the solid, that is, from the side of the pressure
     faces: NDArray[np.int64]
 
     @property
@@ -41,17 +46,23 @@ class Chamber:
 
     @property
     def edges(self) -> NDArray[np.int64]:
-        """(E, 2 | 3) vertices of the edges that belong to one face alone, ends first; none if the surface is closed."""
+        """(E, 2 | 3) vertices of the edges that belong to one face alone, ends first.
+
+        None if the surface is closed.
+        """
         corners = FACES[self.faces.shape[1]].corners
         ends, middles = self.faces[:, :corners], self.faces[:, corners : 2 * corners]
         nodes = [ends, np.roll(ends, -1, axis=1), *([middles] if middles.shape[1] else [])]
-        edges, count = np.stack(nodes, axis=-1).reshape(-1, len(nodes)), int(self.faces.max(initial=0)) + 1
+        edges = np.stack(nodes, axis=-1).reshape(-1, len(nodes))
+        count = int(self.faces.max(initial=0)) + 1
         ahead, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
         return edges[~np.isin(ahead, back)]
 
 
 def face_rule(chambers: Sequence[Chamber], degree: int) -> tuple[Shape, Rule]:
-    """Returns shape functions of the faces, and a rule exact for linear faces and a degree on quadratic ones."""
+    """Returns shape functions of the faces, and a rule exact
+    for linear faces and a degree on quadratic ones.
+    """
     face = FACES[chambers[0].faces.shape[1]]
     return face.shape, face.rule(degree)
 
@@ -59,12 +70,12 @@ def face_rule(chambers: Sequence[Chamber], degree: int) -> tuple[Shape, Rule]:
 def find_chambers(mesh: Mesh, axis: Sequence[float] = (0.0, 0.0, -1.0)) -> tuple[Chamber, ...]:
     """Returns the closed inner components of a body's boundary, in a fixed order.
 
-    A component is a chamber if its faces enclose a negative volume with the solid's orientation. A cavity that is open
-    to the outside is part of the outer surface and not a chamber.
+    A component is a chamber if its faces enclose a negative volume with the solid's orientation. A
+    cavity that is open to the outside is part of the outer surface and not a chamber.
 
-    Chambers are named ``chamber_1`` and so on, ordered along the axis, which points from the clamped end along the
-    body; chambers side by side are ordered by their angle about it, counter-clockwise looking against the axis, from
-    the x direction (y if the axis is x).
+    Chambers are named ``chamber_1`` and so on, ordered along the axis, which points from the
+    clamped end along the body; chambers side by side are ordered by their angle about it,
+    counter-clockwise looking against the axis, from the x direction (y if the axis is x).
     """
     faces = boundary_faces(mesh)
     owner = connected_parts(faces)
@@ -77,7 +88,9 @@ def find_chambers(mesh: Mesh, axis: Sequence[float] = (0.0, 0.0, -1.0)) -> tuple
 
 
 def outer_surface(mesh: Mesh, axis: Sequence[float] = (0.0, 0.0, -1.0)) -> Chamber:
-    """Returns the faces of a body's boundary that look away from its middle line along an axis, as ``outside``."""
+    """Returns the faces of a body's boundary that look away
+    from its middle line along an axis, as ``outside``.
+    """
     faces, along = boundary_faces(mesh), np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
     inner = [chamber.faces[:, 0] for chamber in find_chambers(mesh, axis)]
     faces = faces[~np.isin(faces[:, 0], np.concatenate([*inner, faces[:0, 0]]))]
@@ -86,10 +99,14 @@ def outer_surface(mesh: Mesh, axis: Sequence[float] = (0.0, 0.0, -1.0)) -> Chamb
     middle = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
     away = mesh.vertices[faces].mean(axis=1) - middle
     away -= np.outer(away @ along, along)
-    return Chamber("outside", faces[(np.cross(*tangents) * away).sum(axis=1) > 1e-9 * np.abs(away).max() ** 3])
+    return Chamber(
+        "outside", faces[(np.cross(*tangents) * away).sum(axis=1) > 1e-9 * np.abs(away).max() ** 3]
+    )
 
 
-def _along(mesh: Mesh, surfaces: Sequence[NDArray[np.int64]], axis: NDArray[np.float64]) -> list[int]:
+def _along(
+    mesh: Mesh, surfaces: Sequence[NDArray[np.int64]], axis: NDArray[np.float64]
+) -> list[int]:
     """Returns the order of surfaces along and about an axis."""
     along = axis / np.linalg.norm(axis)
     across = np.eye(3)[0 if abs(along[0]) < 0.9 else 1]
@@ -109,11 +126,12 @@ def _along(mesh: Mesh, surfaces: Sequence[NDArray[np.int64]], axis: NDArray[np.f
 
 
 def check_chambers(chambers: Sequence[Chamber], mesh: Mesh) -> None:
-    """Checks that chambers are surfaces of a mesh, correctly oriented if closed (open ones: `check_open_faces`).
+    """Checks that chambers are surfaces of a mesh, correctly oriented
+    if closed (open ones: `check_open_faces`).
 
     Raises:
-        MeshError: a chamber without faces, with vertices that the mesh does not have, with wrong orientation, or with a
-            face of another chamber.
+        MeshError: a chamber without faces, with vertices that the mesh does not have, with wrong
+            orientation, or with a face of another chamber.
     """
     owners: dict[frozenset[int], str] = {}
     for chamber in chambers:
@@ -122,23 +140,31 @@ def check_chambers(chambers: Sequence[Chamber], mesh: Mesh) -> None:
             raise MeshError(f"{chamber.name} has no faces: name the surface that bounds it.")
         if faces.min() < 0 or faces.max() >= len(mesh.vertices):
             raise MeshError(
-                f"{chamber.name} has faces of vertices that the mesh does not have: take both from one file."
+                f"{chamber.name} has faces of vertices that the mesh does not have: "
+                "take both from one file."
             )
         triangles = face_triangles(faces)
-        volume = -float(np.linalg.det(mesh.vertices[triangles] - mesh.vertices[triangles[0, 0]]).sum()) / 6.0
+        volume = (
+            -float(np.linalg.det(mesh.vertices[triangles] - mesh.vertices[triangles[0, 0]]).sum())
+            / 6.0
+        )
         if volume <= 0.0 and not len(chamber.edges):
             raise MeshError(
-                f"the faces of {chamber.name} look into the solid, or it is the outer surface of the body: list the "
-                "vertices of each face counter-clockwise as seen from inside the chamber."
+                f"the faces of {chamber.name} look into the solid, or it is the outer surface of "
+                "the body: list the vertices of each face counter-clockwise "
+                "as seen from inside the chamber."
             )
         for face in map(frozenset, faces.tolist()):
             other = owners.setdefault(face, chamber.name)
             if other != chamber.name:
-                raise MeshError(f"{chamber.name} and {other} share a face: every face belongs to one chamber.")
+                raise MeshError(
+                    f"{chamber.name} and {other} share a face: every face belongs to one chamber."
+                )
 
 
 def check_open_faces(chamber: Chamber, mesh: Mesh, held: NDArray[np.bool_]) -> None:
-    """Checks that open faces look out of the solid, and that their pressure has a potential: their edges are held.
+    """Checks that open faces look out of the solid,
+    and that their pressure has a potential: their edges are held.
 
     Args:
         chamber: with edges.
@@ -149,18 +175,23 @@ def check_open_faces(chamber: Chamber, mesh: Mesh, held: NDArray[np.bool_]) -> N
         MeshError: a face that is not on the surface of the body, or an edge that can move.
     """
     surface = {*map(tuple, _from_lowest(boundary_faces(mesh)).tolist())}
-    inner = [face for face in map(tuple, _from_lowest(chamber.faces).tolist()) if face not in surface]
+    inner = [
+        face for face in map(tuple, _from_lowest(chamber.faces).tolist()) if face not in surface
+    ]
     if inner:
         raise MeshError(
-            f"{len(inner)} of the {len(chamber.faces)} faces of {chamber.name} look into the solid, or are not on the "
-            "surface of the body: take faces from select_faces, read_surfaces or boundary_faces."
+            f"{len(inner)} of the {len(chamber.faces)} faces of {chamber.name} look into the "
+            "solid, or are not on the surface of the body: take faces from select_faces, "
+            "read_surfaces or boundary_faces."
         )
     if not held.all():
-        where = ", ".join(f"{1e3 * x:.1f}" for x in mesh.vertices[chamber.edges[~held][0]].mean(axis=0))
+        where = ", ".join(
+            f"{1e3 * x:.1f}" for x in mesh.vertices[chamber.edges[~held][0]].mean(axis=0)
+        )
         raise MeshError(
-            f"{chamber.name} has {int((~held).sum())} open edges that can move, one of them at ({where}) mm: close the "
-            "surface, fix the vertices of its edges, or let these lie in symmetry planes, as pressure has no potential "
-            "otherwise."
+            f"{chamber.name} has {int((~held).sum())} open edges that can move, one of them at "
+            f"({where}) mm: close the surface, fix the vertices of its edges, or let these lie "
+            "in symmetry planes, as pressure has no potential otherwise."
         )
 
 
@@ -180,16 +211,19 @@ class OpenCavity:
 
 
 def open_cavities(mesh: Mesh) -> list[OpenCavity]:
-    """Finds deep hollows in the outer surface, such as a chamber with a hole in its wall or without an end.
+    """Finds deep hollows in the outer surface, such
+    as a chamber with a hole in its wall or without an end.
 
-    Rays in uniformly distributed directions start from the centre of each triangle; if few of them leave the body
-    without hitting it, the triangle is hidden. Connected hidden triangles form a cavity. Largest cavities come first.
+    Rays in uniformly distributed directions start from the centre of each triangle; if few of them
+    leave the body without hitting it, the triangle is hidden. Connected hidden triangles form a
+    cavity. Largest cavities come first.
     """
     triangles = boundary_triangles(mesh)
     inner = [chamber.vertices for chamber in find_chambers(mesh)]
     outer = triangles[~np.isin(triangles[:, 0], np.concatenate(inner))] if inner else triangles
     corners = mesh.vertices[outer]
-    normals, centres = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners.mean(axis=1)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    centres = corners.mean(axis=1)
     sizes = np.linalg.norm(normals, axis=1)
     normals /= sizes[:, None]
     starts = centres + _LIFT * np.linalg.norm(np.ptp(mesh.vertices, axis=0)) * normals
@@ -214,7 +248,7 @@ def open_cavities(mesh: Mesh) -> list[OpenCavity]:
 
 
 def _half_sphere(normals: FloatArray) -> FloatArray:
-    """Returns unit vectors (T, D, 3), uniformly distributed over the hemisphere of each normal (T, 3)."""
+    """Unit vectors (T, D, 3), uniformly distributed over the hemisphere of each normal (T, 3)."""
     heights = (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
     angles = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(_DIRECTIONS)  # golden spiral
     local = np.stack([np.cos(angles), np.sin(angles)], axis=1) * np.sqrt(1.0 - heights**2)[:, None]

@@ -1,7 +1,7 @@
 """Finite elements: nodes in VTK order, shape functions, quadrature and faces.
 
-An element is one entry of `ELEMENTS`. Its shape functions are the polynomials with given exponents that are one at one
-node and zero at the others.
+An element is one entry of `ELEMENTS`. Its shape functions are the polynomials with given exponents
+that are one at one node and zero at the others.
 """
 
 from dataclasses import dataclass
@@ -19,19 +19,26 @@ Rule = tuple[Array, Array]  # points (Q, d) and weights (Q,)
 
 def _products(values: NDArray[Any], dimension: int) -> NDArray[Any]:
     """Returns all combinations of values, (n^d, d), with the last coordinate varying fastest."""
-    return np.stack(np.meshgrid(*[values] * dimension, indexing="ij"), axis=-1).reshape(-1, dimension)
+    return np.stack(np.meshgrid(*[values] * dimension, indexing="ij"), axis=-1).reshape(
+        -1, dimension
+    )
 
 
 def gauss_box(order: int, dimension: int = 3) -> Rule:
-    """Returns the product Gauss rule on [-1, 1]^d, exact up to degree 2 order - 1 in each coordinate."""
+    """Returns the product Gauss rule on [-1, 1]^d, exact up
+    to degree 2 order - 1 in each coordinate.
+    """
     x, w = np.polynomial.legendre.leggauss(order)
     return _products(x, dimension), np.prod(_products(w, dimension), axis=-1)
 
 
 def conical_simplex(order: int, dimension: int = 3) -> Rule:
-    """Returns the conical product Gauss rule on the unit simplex (Stroud 1971), exact up to degree 2 order - d."""
+    """Returns the conical product Gauss rule on the unit simplex (Stroud 1971),
+    exact up to degree 2 order - d.
+    """
     x, w = np.polynomial.legendre.leggauss(order)
-    points, weights = _products((x + 1.0) / 2.0, dimension), np.prod(_products(w / 2.0, dimension), axis=-1)
+    points = _products((x + 1.0) / 2.0, dimension)
+    weights = np.prod(_products(w / 2.0, dimension), axis=-1)
     left = np.ones_like(weights)
     for axis in range(dimension):
         inner = 1.0 - points[:, axis]
@@ -64,14 +71,19 @@ class Shape:
         for axis in range(self.exponents.shape[1]):
             lower = self.exponents.copy()
             lower[:, axis] = np.maximum(lower[:, axis] - 1, 0)
-            slopes.append((_monomials(points, lower) * self.exponents[:, axis]) @ self._coefficients)
+            slopes.append(
+                (_monomials(points, lower) * self.exponents[:, axis]) @ self._coefficients
+            )
         return _monomials(points, self.exponents) @ self._coefficients, np.stack(slopes, axis=-1)
 
 
 def _monomials(points: Array, exponents: IntArray) -> Array:
     """Returns x^a y^b z^c, (Q, K)."""
-    powers = np.cumprod([np.ones_like(points), *[points] * int(exponents.max())], axis=0)  # (E, Q, d)
-    return np.asarray(np.prod([powers[exponent, :, axis] for axis, exponent in enumerate(exponents.T)], axis=0).T)
+    # (E, Q, d)
+    powers = np.cumprod([np.ones_like(points), *[points] * int(exponents.max())], axis=0)
+    return np.asarray(
+        np.prod([powers[exponent, :, axis] for axis, exponent in enumerate(exponents.T)], axis=0).T
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +95,17 @@ class Face:
     triangles: IntArray  # (T, 3) nodes of its triangles, with the face's orientation
 
     def rule(self, degree: int) -> Rule:
-        """Returns a rule that is exact for linear fields on linear faces, and for a degree on quadratic ones."""
+        """Returns a rule that is exact for linear fields on linear faces,
+        and for a degree on quadratic ones.
+        """
         quadratic = len(self.shape.nodes) > self.corners
         if self.corners == 4:
             return gauss_box(degree // 2 + 1 if quadratic else 2, 2)
-        return conical_simplex(degree // 2 + 1, 2) if quadratic else (np.full((1, 2), 1.0 / 3.0), np.full(1, 0.5))
+        return (
+            conical_simplex(degree // 2 + 1, 2)
+            if quadratic
+            else (np.full((1, 2), 1.0 / 3.0), np.full(1, 0.5))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +117,14 @@ class Element:
     parents: list[list[int]]  # for each other node, the corners whose mean it is
     rule: Rule  # points and weights of the shape term of an energy
     faces: IntArray  # (F, n) nodes, counter-clockwise seen from outside, corners first
-    # (m, 3) exponents of the polynomials onto which the deformation gradient of the volume term is projected against
-    # locking; None: means over the cells around each vertex
+    # (m, 3) exponents of the polynomials onto which the deformation gradient of the volume term is
+    # projected against locking; None: means over the cells around each vertex
     volume_modes: IntArray | None
-    volume_rule: Rule | None = None  # points and weights of the volume term; None: one point with the element's volume
-    # rule that is exact for products of shape functions, for masses in proportion to the diagonal of the consistent
-    # mass matrix; None: row sums
+    volume_rule: Rule | None = (
+        None  # points and weights of the volume term; None: one point with the element's volume
+    )
+    # rule that is exact for products of shape functions, for masses in proportion to the diagonal
+    # of the consistent mass matrix; None: row sums
     mass_rule: Rule | None = None
 
     @property
@@ -159,14 +179,26 @@ def _serendipity(exponents: IntArray) -> IntArray:
 
 def _between(corners: Array, parents: list[list[int]]) -> Array:
     """Returns the corners followed by the means of groups of corners."""
-    return np.concatenate([corners, *(corners[group].mean(axis=0, keepdims=True) for group in parents)])
+    return np.concatenate(
+        [corners, *(corners[group].mean(axis=0, keepdims=True) for group in parents)]
+    )
 
 
 _TETRAHEDRON = np.concatenate([np.zeros((1, 3)), np.eye(3)])
 _TETRAHEDRON_EDGES = [[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]]
 _TETRAHEDRON_FACES = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
 _HEXAHEDRON = np.array(
-    [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], dtype=float
+    [
+        [-1, -1, -1],
+        [1, -1, -1],
+        [1, 1, -1],
+        [-1, 1, -1],
+        [-1, -1, 1],
+        [1, -1, 1],
+        [1, 1, 1],
+        [-1, 1, 1],
+    ],
+    dtype=float,
 )
 _HEXAHEDRON_EDGES = [
     *([0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4]),
@@ -176,14 +208,23 @@ _HEXAHEDRON_MIDDLES = [
     *([0, 4, 7, 3], [1, 2, 6, 5], [0, 1, 5, 4], [3, 7, 6, 2], [0, 3, 2, 1], [4, 5, 6, 7]),
     list(range(8)),
 ]
-_HEXAHEDRON_FACES = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
+_HEXAHEDRON_FACES = [
+    [0, 3, 2, 1],
+    [4, 5, 6, 7],
+    [0, 1, 5, 4],
+    [1, 2, 6, 5],
+    [2, 3, 7, 6],
+    [3, 0, 4, 7],
+]
 _TRIANGLE, _TRIANGLE_EDGES = _TETRAHEDRON[:3, :2], [[0, 1], [1, 2], [2, 0]]
 _SQUARE, _SQUARE_EDGES = _HEXAHEDRON[:4, :2], [[0, 1], [1, 2], [2, 3], [3, 0]]
 _CONSTANT = np.zeros((1, 3), dtype=np.int64)
 _LINEAR = np.concatenate([_CONSTANT, np.eye(3, dtype=np.int64)])
 
 
-def _element(name: str, corners: Array, exponents: IntArray, parents: list[list[int]], **rules: Any) -> Element:
+def _element(
+    name: str, corners: Array, exponents: IntArray, parents: list[list[int]], **rules: Any
+) -> Element:
     """Returns an element with nodes at the corners and at the means of groups of corners."""
     place = {frozenset(group): len(corners) + number for number, group in enumerate(parents)}
     faces = []
@@ -195,26 +236,48 @@ def _element(name: str, corners: Array, exponents: IntArray, parents: list[list[
 
 
 FACES: dict[int, Face] = {
-    len(exponents): Face(Shape(_between(corners, parents), exponents), len(corners), np.array(triangles))
+    len(exponents): Face(
+        Shape(_between(corners, parents), exponents), len(corners), np.array(triangles)
+    )
     for corners, parents, exponents, triangles in (
         (_TRIANGLE, [], _exponents(1, total=1, others=2), [[0, 1, 2]]),
         (_SQUARE, [], _exponents(1, others=2), [[0, 1, 2], [0, 2, 3]]),
-        (*(_TRIANGLE, _TRIANGLE_EDGES, _exponents(2, total=2, others=2)), [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
+        (
+            *(_TRIANGLE, _TRIANGLE_EDGES, _exponents(2, total=2, others=2)),
+            [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]],
+        ),
         (
             *(_SQUARE, _SQUARE_EDGES, _serendipity(_exponents(2, others=2))),
             [[0, 4, 7], [4, 1, 5], [5, 2, 6], [6, 3, 7], [4, 5, 6], [4, 6, 7]],
         ),
         (
             *(_SQUARE, [*_SQUARE_EDGES, [0, 1, 2, 3]], _exponents(2, others=2)),
-            [[0, 4, 8], [0, 8, 7], [4, 1, 5], [4, 5, 8], [8, 5, 2], [8, 2, 6], [7, 8, 6], [7, 6, 3]],
+            [
+                [0, 4, 8],
+                [0, 8, 7],
+                [4, 1, 5],
+                [4, 5, 8],
+                [8, 5, 2],
+                [8, 2, 6],
+                [7, 8, 6],
+                [7, 6, 3],
+            ],
         ),
     )
 }
 
-_ONE_POINT: dict[str, Any] = {"rule": (np.full((1, 3), 0.25), np.full(1, 1.0 / 6.0)), "volume_modes": None}
-_KEAST: dict[str, Any] = {"rule": degree_two_tetrahedron(), "volume_modes": _CONSTANT, "mass_rule": conical_simplex(4)}
+_ONE_POINT: dict[str, Any] = {
+    "rule": (np.full((1, 3), 0.25), np.full(1, 1.0 / 6.0)),
+    "volume_modes": None,
+}
+_KEAST: dict[str, Any] = {
+    "rule": degree_two_tetrahedron(),
+    "volume_modes": _CONSTANT,
+    "mass_rule": conical_simplex(4),
+}
 _TRILINEAR: dict[str, Any] = {"rule": gauss_box(2), "volume_modes": _CONSTANT}
-# Four of the eight Gauss points, which integrate quadratic polynomials: as many points as linear modes.
+# Four of the eight Gauss points, which integrate quadratic polynomials: as many points as linear
+# modes.
 _FOUR_POINTS = _HEXAHEDRON[[0, 2, 5, 7]] / np.sqrt(3.0), np.full(4, 2.0)
 _TRIQUADRATIC: dict[str, Any] = {
     "rule": gauss_box(3),
@@ -228,9 +291,17 @@ ELEMENTS: dict[str, Element] = {
     element.name: element
     for element in (
         _element("tetrahedron", _TETRAHEDRON, _exponents(1, total=1), [], **_ONE_POINT),
-        _element("tetrahedron10", _TETRAHEDRON, _exponents(2, total=2), _TETRAHEDRON_EDGES, **_KEAST),
+        _element(
+            "tetrahedron10", _TETRAHEDRON, _exponents(2, total=2), _TETRAHEDRON_EDGES, **_KEAST
+        ),
         _element("hexahedron", _HEXAHEDRON, _exponents(1), [], **_TRILINEAR),
-        _element("hexahedron20", _HEXAHEDRON, _serendipity(_exponents(2)), _HEXAHEDRON_EDGES, **_TRIQUADRATIC),
+        _element(
+            "hexahedron20",
+            _HEXAHEDRON,
+            _serendipity(_exponents(2)),
+            _HEXAHEDRON_EDGES,
+            **_TRIQUADRATIC,
+        ),
         _element("hexahedron27", _HEXAHEDRON, _exponents(2), _MIDDLES, **_TRIQUADRATIC),
     )
 }

@@ -10,7 +10,8 @@ from ..io.arrays import FloatArray, IntArray
 from .elements import ELEMENTS, Element
 
 BODY: Final = "#a9bccf"
-REGIONS: Final = ("#56b4e9", "#e69f00", "#009e73", "#cc79a7", "#f0e442", "#0072b2")  # of Okabe and Ito (2008)
+# Of Okabe and Ito (2008).
+REGIONS: Final = ("#56b4e9", "#e69f00", "#009e73", "#cc79a7", "#f0e442", "#0072b2")
 FIXED: Final = "#33485e"
 _DOT: Final = 8.0  # px
 
@@ -27,8 +28,8 @@ def plot_parts(
     """Draws meshes with their regions in colours, and returns the plotter.
 
     Args:
-        parts: of each mesh the points (N, 3) [m]; its cells (M, K), of which the corners are drawn; their kind; and
-            cells by name of their region, of which later ones cover earlier ones.
+        parts: of each mesh the points (N, 3) [m]; its cells (M, K), of which the corners are drawn;
+            their kind; and cells by name of their region, of which later ones cover earlier ones.
         dots: (P, 3) points drawn as dots [m].
         screenshot: PNG file to draw off screen; None: a window, or a viewer in a notebook.
         plotter: a ``pyvista.Plotter`` to add to, which is shown by the caller; None: a new one.
@@ -47,7 +48,10 @@ def plot_parts(
             used, numbered = np.unique(corners, return_inverse=True)
             kind = getattr(pyvista.CellType, linear.file_type.upper())
             grid = pyvista.UnstructuredGrid({kind: numbered.reshape(corners.shape)}, points[used])
-            look = {"color": BODY if number < 0 else REGIONS[number % len(REGIONS)], "show_edges": True}
+            look = {
+                "color": BODY if number < 0 else REGIONS[number % len(REGIONS)],
+                "show_edges": True,
+            }
             label = None if number < 0 else names[number]
             named |= label is not None
             drawn.add_mesh(grid, **{**look, "label": label, **options})

@@ -10,14 +10,15 @@ from .volume_mesh import Mesh, boundary_faces
 def scaled_jacobian(mesh: Mesh) -> FloatArray:
     """Returns the smallest scaled Jacobian of each cell (M,) (Knupp 2000), from -1 to 1.
 
-    It is 1 for a cube or a regular tetrahedron, 0 for a flat cell. At a corner, it is the volume spanned by the edges,
-    over the product of their lengths. All corners of a tetrahedron span the same volume, and the largest product
-    counts. Nodes between corners are ignored.
+    It is 1 for a cube or a regular tetrahedron, 0 for a flat cell. At a corner, it is the volume
+    spanned by the edges, over the product of their lengths. All corners of a tetrahedron span the
+    same volume, and the largest product counts. Nodes between corners are ignored.
     """
     linear = ELEMENTS[mesh.element.linear]
     corners = mesh.vertices[mesh.cells[:, : linear.nodes]]
     both = np.concatenate([linear.edges, linear.edges[:, ::-1]])
-    spokes = np.stack([both[both[:, 0] == corner, 1] for corner in range(linear.nodes)])  # (corners, 3)
+    # (corners, 3)
+    spokes = np.stack([both[both[:, 0] == corner, 1] for corner in range(linear.nodes)])
     edges = corners[:, spokes] - corners[:, : linear.nodes, None]  # (M, corners, 3 edges, 3)
     spanned = np.einsum("qki,mkj->mqij", linear.shape(linear.shape.nodes)[1], corners)
     sizes = np.linalg.norm(edges, axis=-1).prod(axis=-1)

@@ -15,7 +15,11 @@ Extent = float | Sequence[float]  # a coordinate, or a range of coordinates
 
 
 def select_vertices(
-    mesh: Mesh, x: Extent | None = None, y: Extent | None = None, z: Extent | None = None, tolerance: float = 1e-9
+    mesh: Mesh,
+    x: Extent | None = None,
+    y: Extent | None = None,
+    z: Extent | None = None,
+    tolerance: float = 1e-9,
 ) -> IntArray:
     """Returns the vertices (S,) in a plane, a slab or a box, sorted.
 
@@ -34,9 +38,14 @@ def select_vertices(
 
 
 def select_faces(
-    mesh: Mesh, x: Extent | None = None, y: Extent | None = None, z: Extent | None = None, tolerance: float = 1e-9
+    mesh: Mesh,
+    x: Extent | None = None,
+    y: Extent | None = None,
+    z: Extent | None = None,
+    tolerance: float = 1e-9,
 ) -> IntArray:
-    """Returns the faces (F, n) of the surface with all vertices in a plane, a slab or a box, as `boundary_faces`.
+    """Returns the faces (F, n) of the surface with all vertices in a plane,
+    a slab or a box, as `boundary_faces`.
 
     Args:
         mesh: The mesh.
@@ -68,12 +77,16 @@ def vertices_at(mesh: Mesh, place: Place) -> IntArray:
     chosen = np.flatnonzero(place.holds(mesh.vertices))
     if not len(chosen):
         low, high, axes = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0), [*place.spans]
-        there = ", ".join(f"{axis} from {low['xyz'.index(axis)]:g} to {high['xyz'.index(axis)]:g}" for axis in axes)
+        there = ", ".join(
+            f"{axis} from {low['xyz'.index(axis)]:g} to {high['xyz'.index(axis)]:g}"
+            for axis in axes
+        )
+        first = "xyz".index(axes[0])
+        tenth = 0.1 * (high[first] - low[first])
         raise MeshError(
-            f"no vertex lies within {place.nearness:g} m of {place} m: the mesh reaches {there} m; give a range for a "
-            f"face that is not flat, as in {axes[0]}=[{low['xyz'.index(axes[0])]:.3g}, "
-            f"{low['xyz'.index(axes[0])] + 0.1 * float(np.ptp(mesh.vertices[:, 'xyz'.index(axes[0])])):.3g}], or a "
-            "larger tolerance"
+            f"no vertex lies within {place.nearness:g} m of {place} m: the mesh reaches "
+            f"{there} m; give a range for a face that is not flat, as in "
+            f"{axes[0]}=[{low[first]:.3g}, {low[first] + tenth:.3g}], or a larger tolerance"
         )
     return chosen
 
@@ -87,7 +100,10 @@ def faces_at(mesh: Mesh, place: Place) -> IntArray:
     faces = boundary_faces(mesh)
     faces = faces[np.isin(faces, vertices_at(mesh, place)).all(axis=1)]
     if not len(faces):
-        raise MeshError(f"no face of the surface has all its vertices at {place} m: choose a place with whole faces")
+        raise MeshError(
+            f"no face of the surface has all its vertices at {place} m: "
+            "choose a place with whole faces"
+        )
     return faces
 
 
@@ -97,7 +113,8 @@ def select_cells(
     y: Sequence[float] = (-np.inf, np.inf),
     z: Sequence[float] = (-np.inf, np.inf),
 ) -> IntArray:
-    """Returns the cells (S,) with centres in a box, given by a range of coordinates along each axis [m].
+    """Returns the cells (S,) with centres in a box,
+    given by a range of coordinates along each axis [m].
 
     Raises:
         MeshError: no cell lies there.
@@ -106,8 +123,12 @@ def select_cells(
     centres, box = mesh.vertices[corners].mean(axis=1), np.array([x, y, z], dtype=np.float64)
     chosen = ((centres >= box[:, 0]) & (centres <= box[:, 1])).all(axis=1)
     if not chosen.any():
-        asked = ", ".join(f"{axis} from {low:g} to {high:g}" for axis, (low, high) in zip("xyz", box, strict=True))
+        asked = ", ".join(
+            f"{axis} from {low:g} to {high:g}" for axis, (low, high) in zip("xyz", box, strict=True)
+        )
         ranges = zip("xyz", centres.min(axis=0), centres.max(axis=0), strict=True)
         there = ", ".join(f"{axis} from {low:g} to {high:g}" for axis, low, high in ranges)
-        raise MeshError(f"no cell has its centre within {asked} m: those of the mesh reach {there} m")
+        raise MeshError(
+            f"no cell has its centre within {asked} m: those of the mesh reach {there} m"
+        )
     return np.flatnonzero(chosen)

@@ -1,4 +1,6 @@
-"""Bodies seen by cameras: outlines, tracked points, depths and scans, and the parameters that explain them."""
+"""Bodies seen by cameras: outlines, tracked points, depths and scans,
+and the parameters that explain them.
+"""
 
 from ..data.camera import CameraMarkers as CameraMarkers
 from ..data.camera import Lens as Lens

@@ -1,15 +1,19 @@
-"""Points of a body's surface without identity: scans, and depth images; their distances from a simulated body.
+"""Points of a body's surface without identity: scans, and depth images.
 
-A measured point is compared with the closest point of the deformed surface. Its distance is differentiated along the
-line between the two, on which a shift of the closest point within the surface has no effect to first order (Besl and
-McKay 1992; with plane triangles this is the point-to-plane distance of Chen and Medioni 1992, except at edges). Only
-triangles on the side from which a point was seen are compared with it: towards the camera of a depth image, or towards
-the outer normal of a scanned surface. Parts of the body that no point shows do not count.
+Their distances from a simulated body.
 
-Outliers hardly matter, by the robust loss of `picture_misfit`, and points beyond a reach not at all; before that, most
-are left out by `Cloud.around`.
+A measured point is compared with the closest point of the deformed surface. Its distance is
+differentiated along the line between the two, on which a shift of the closest point within the
+surface has no effect to first order (Besl and McKay 1992; with plane triangles this is the
+point-to-plane distance of Chen and Medioni 1992, except at edges). Only triangles on the side from
+which a point was seen are compared with it: towards the camera of a depth image, or towards the
+outer normal of a scanned surface. Parts of the body that no point shows do not count.
 
-`tests/pictures/test_clouds.py` compares distances with closed forms, and derivatives with differences.
+Outliers hardly matter, by the robust loss of `picture_misfit`, and points beyond a reach not at
+all; before that, most are left out by `Cloud.around`.
+
+`tests/pictures/test_clouds.py` compares distances with closed forms, and derivatives with
+differences.
 """
 
 from dataclasses import dataclass, replace
@@ -26,10 +30,13 @@ from ..mesh.surface import closest_of, closest_points
 from ..mesh.volume_mesh import Mesh
 from .outlines import Mask
 
-_STRAY: Final = 1.0  # % of the points that may lie far away in a direction, when their extent is measured
+_STRAY: Final = (
+    1.0  # % of the points that may lie far away in a direction, when their extent is measured
+)
 _LEAST: Final = 20  # points on a body
 _NEIGHBOURS: Final = 8  # of a point
-_ISOLATED: Final = 3.0  # distance of the last of these, over the median of all points, beyond which it is an outlier
+# Distance of the last of these, over the median of all points, beyond which it is an outlier.
+_ISOLATED: Final = 3.0
 _LONGER: Final = 1.2  # of the length of a body: what it may be stretched to
 _SIZES: Final = (0.05, 200.0)  # of a cloud with its background, over that of the body
 
@@ -39,7 +46,9 @@ class Cloud:
     """Measured points, in the axes of a scan or as pixels with depths (`PlacedCamera.located`)."""
 
     measured: FloatArray  # (P, 3) points [m], or pixels and depths [px, px, m]
-    outside: FloatArray | None = None  # (P, 3) another place towards which the surface faces; None where not known
+    outside: FloatArray | None = (
+        None  # (P, 3) another place towards which the surface faces; None where not known
+    )
     noise: float = 1e-3  # standard deviation of a distance [m]
     reach: float = 0.05  # distance from which points have no effect [m]
 
@@ -56,11 +65,15 @@ class Cloud:
         measured = np.stack([columns, rows, depth[seen]], 1).astype(np.float64)
         return cls(measured, measured * (1.0, 1.0, 0.0))  # at depth zero is the camera
 
-    def around(self, camera: PlacedCamera, mesh: Mesh, clamped: IntArray, count: int = 1000, seed: int = 0) -> Self:
-        """Returns at most a number of points that may be of a body, in their order along the longest axis.
+    def around(
+        self, camera: PlacedCamera, mesh: Mesh, clamped: IntArray, count: int = 1000, seed: int = 0
+    ) -> Self:
+        """Returns at most a number of points that may be of a body,
+        in their order along the longest axis.
 
-        Left out are points farther from the clamp than the body is long, isolated ones, and those that are closest to a
-        clamp of the undeformed body. A choice that followed the body would let it evade points.
+        Left out are points farther from the clamp than the body is long, isolated ones, and those
+        that are closest to a clamp of the undeformed body. A choice that followed the body would
+        let it evade points.
 
         Args:
             camera: by which they are located, about the centre of the body's clamp.
@@ -73,20 +86,27 @@ class Cloud:
             InputError: hardly a point may be of the body, or the cloud has another unit of length.
         """
         centre, vertices = camera.centre.numpy(), mesh.vertices
-        places = camera.located(torch.as_tensor(self.measured), PlacedCamera.corrections({})).numpy()
+        places = camera.located(
+            torch.as_tensor(self.measured), PlacedCamera.corrections({})
+        ).numpy()
         length = float(np.linalg.norm(vertices - centre, axis=1).max())
         known = places[np.isfinite(places).all(1)]  # NaN where a lens cannot see
         away = np.linalg.norm(places - centre, axis=1)
         close = np.flatnonzero(away < _LONGER * length + self.reach)
         if not len(known):
-            raise InputError("none of its points is in the view of its lens: check the lens (data.lens).")
+            raise InputError(
+                "none of its points is in the view of its lens: check the lens (data.lens)."
+            )
         ends = np.percentile(known, [_STRAY, 100.0 - _STRAY], axis=0)
-        size, extent = (float(np.linalg.norm(np.ptp(points, axis=0))) for points in (ends, vertices))
+        size, extent = (
+            float(np.linalg.norm(np.ptp(points, axis=0))) for points in (ends, vertices)
+        )
         if len(close) < _LEAST or not _SIZES[0] < size / extent < _SIZES[1]:
             raise InputError(
-                f"{len(close)} of its {len(places)} points are close enough to the clamp to be of the body; they are "
-                f"{size:.3g} m across and {np.nanmedian(away):.3g} m from the clamp, and the body is {extent:.3g} m "
-                "across: check the unit (data.cloud.units of a scan, data.cloud.depth_unit of a depth image) and the "
+                f"{len(close)} of its {len(places)} points are close enough to the clamp to be "
+                f"of the body; they are {size:.3g} m across and {np.nanmedian(away):.3g} m from "
+                f"the clamp, and the body is {extent:.3g} m across: check the unit "
+                "(data.cloud.units of a scan, data.cloud.depth_unit of a depth image) and the "
                 "pose (world_to_cloud, world_to_camera)."
             )
         spacing = cKDTree(places[close]).query(places[close], _NEIGHBOURS + 1)[0][:, -1]
@@ -96,8 +116,9 @@ class Cloud:
         close = close[~np.isin(closest_points(mesh, places[close]).triangles, clamped).all(1)]
         if len(close) < _LEAST:
             raise InputError(
-                f"{len(close)} of its {len(places)} points are left without clamp, background and isolated ones: "
-                "check the directions of its pose (world_to_cloud, world_to_camera)."
+                f"{len(close)} of its {len(places)} points are left without clamp, background "
+                "and isolated ones: check the directions of its pose (world_to_cloud, "
+                "world_to_camera)."
             )
         longest = np.linalg.eigh(np.cov(places[close].T))[1][:, -1]
         chosen = close[np.argsort(places[close] @ longest)]
@@ -124,9 +145,15 @@ class Cloud:
         closest = closest_of(triangles, vertices, places, towards)
         offset = places - closest.points
         length = np.maximum(np.abs(closest.distances), 1e-12)[:, None]
-        directions = np.where(length > 1e-9, np.sign(closest.distances)[:, None] * offset / length, closest.normals)
-        shares = trimesh.triangles.points_to_barycentric(vertices[closest.triangles], closest.points)
-        return CloudDistances(places, closest.triangles, np.asarray(shares), closest.distances, directions)
+        directions = np.where(
+            length > 1e-9, np.sign(closest.distances)[:, None] * offset / length, closest.normals
+        )
+        shares = trimesh.triangles.points_to_barycentric(
+            vertices[closest.triangles], closest.points
+        )
+        return CloudDistances(
+            places, closest.triangles, np.asarray(shares), closest.distances, directions
+        )
 
 
 @dataclass(frozen=True)
@@ -140,6 +167,10 @@ class CloudDistances:
     directions: FloatArray  # (P, 3) gradient of the distance
 
     def moved(self, tangents: torch.Tensor) -> FloatArray:
-        """Returns derivatives (K, P) of the distances by K motions (K, N, 3) of the vertices [m]."""
-        at = torch.einsum("kpci,pc->kpi", tangents[:, torch.as_tensor(self.triangles)], torch.as_tensor(self.shares))
+        """Returns derivatives (K, P) of the distances by K motions (K, N, 3) of vertices [m]."""
+        at = torch.einsum(
+            "kpci,pc->kpi",
+            tangents[:, torch.as_tensor(self.triangles)],
+            torch.as_tensor(self.shares),
+        )
         return -np.einsum("kpi,pi->kp", at.numpy(), self.directions)

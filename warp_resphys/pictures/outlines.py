@@ -1,10 +1,11 @@
-"""Outlines of bodies in pictures: of a mask, of a simulated body, and the distances between the two.
+"""Outlines of bodies in pictures: of a mask, of a simulated body, and distances between the two.
 
-The outline of a simulated body consists of the edges of its surface that separate triangles facing the camera from
-others, where nothing of the body covers them. Its points move with the vertices of their edge, to first order: where
-the outline is formed by other points of the surface a moment later, these move along it (Giblin and Weiss 1987).
-Distances are measured both ways, to the closest point of the other outline (Fitzgibbon 2003): from the measured
-outline, so that it is covered, and from the simulated one, so that nothing of the body lies where none was seen.
+The outline of a simulated body consists of the edges of its surface that separate triangles facing
+the camera from others, where nothing of the body covers them. Its points move with the vertices of
+their edge, to first order: where the outline is formed by other points of the surface a moment
+later, these move along it (Giblin and Weiss 1987). Distances are measured both ways, to the closest
+point of the other outline (Fitzgibbon 2003): from the measured outline, so that it is covered, and
+from the simulated one, so that nothing of the body lies where none was seen.
 
 `tests/pictures/test_outlines.py` compares with outlines of closed form.
 """
@@ -45,32 +46,50 @@ class Outline:
 
     @classmethod
     def of_mask(cls, mask: Mask) -> "Outline":
-        """Returns the outline of a mask, to a fraction of a pixel, without the borders of the picture.
+        """Returns the outline of a mask, to a fraction of a pixel,
+        without the borders of the picture.
 
         Args:
-            mask: (H, W) whether a pixel shows the body; that of row i and column j is at (j, i) [px].
+            mask: (H, W) whether a pixel shows the body; that of row i and column j is at (j, i)
+                [px].
 
         Raises:
             InputError: nothing is seen, or the body fills the picture.
         """
         smooth = np.pad(scipy.ndimage.gaussian_filter(mask.astype(np.float64), _SMOOTH), 1)
-        lines = [np.asarray(line) - 1.0 for line in contourpy.contour_generator(z=smooth).lines(0.5)]
+        lines = [
+            np.asarray(line) - 1.0 for line in contourpy.contour_generator(z=smooth).lines(0.5)
+        ]
         lines = [line for line in lines if len(line) >= _LEAST]
         if not lines:
-            raise InputError("the mask shows nothing of the body: check the picture, or the colours of its mask.")
+            raise InputError(
+                "the mask shows nothing of the body: check the picture, or the colours of its mask."
+            )
         size = (mask.shape[1], mask.shape[0])
-        points, near = (np.concatenate([_evenly(line, by) for line in lines]) for by in (_APART, _NEAR))
+        points, near = (
+            np.concatenate([_evenly(line, by) for line in lines]) for by in (_APART, _NEAR)
+        )
         points, near = points[within(points, size)], near[within(near, size)]
         if not len(points):
             raise InputError("the mask fills the picture: no outline of the body is in it.")
-        region = shapely.build_area(shapely.geometrycollections([shapely.linestrings(line) for line in lines]))
+        region = shapely.build_area(
+            shapely.geometrycollections([shapely.linestrings(line) for line in lines])
+        )
         at = near.T[::-1] + 1.0  # rows and columns of the padded mask
-        slope = np.stack([scipy.ndimage.map_coordinates(part, at, order=1) for part in np.gradient(smooth)[::-1]], 1)
+        slope = np.stack(
+            [
+                scipy.ndimage.map_coordinates(part, at, order=1)
+                for part in np.gradient(smooth)[::-1]
+            ],
+            1,
+        )
         outward = -slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
         return cls(points, region, size, near, outward)
 
     def signed(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Returns distances (P,) of points (P, 2), negative inside, and their gradients (P, 2) [px]."""
+        """Returns distances (P,) of points (P, 2), negative inside,
+        and their gradients (P, 2) [px].
+        """
         _, distance, gradient = _closest(points, self.near, self.outward)
         return distance, gradient
 
@@ -95,13 +114,19 @@ class Silhouette:
         """Returns the closest points of the outline to points (P, 2).
 
         Returns:
-            Their indices (P,), the distances (P,), positive outside of the body, and their gradients (P, 2) [px].
+            Their indices (P,), the distances (P,), positive outside of the body, and their
+            gradients (P, 2) [px].
         """
         return _closest(points, self.pixels, self.outward)
 
 
-def _closest(points: FloatArray, outline: FloatArray, outward: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Closest points of an outline (Q, 2), with unit vectors across it, to points (P, 2); see `Silhouette.closest`."""
+def _closest(
+    points: FloatArray, outline: FloatArray, outward: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Closest points of an outline (Q, 2), with unit vectors across it, to points (P, 2).
+
+    See `Silhouette.closest`.
+    """
     distance, index = cKDTree(outline).query(points)
     between, across = points - outline[index], outward[index]
     side = np.where((between * across).sum(1) < 0.0, -1.0, 1.0)
@@ -113,7 +138,9 @@ def _closest(points: FloatArray, outline: FloatArray, outward: FloatArray) -> tu
 
 @dataclass(frozen=True)
 class ClosedSurface:
-    """The closed surface of a body: F triangles, their E edges, and the two triangles at every edge."""
+    """The closed surface of a body: F triangles, their E edges,
+    and the two triangles at every edge.
+    """
 
     triangles: IntArray  # (F, 3)
     edges: IntArray  # (E, 2)
@@ -131,7 +158,9 @@ class ClosedSurface:
         triangles = boundary_triangles(body) if isinstance(body, Mesh) else body
         beside, edges = trimesh.graph.face_adjacency(triangles, return_edges=True)
         if 2 * len(edges) != 3 * len(triangles):
-            raise InputError("the surface of the body is not closed: every edge must belong to two triangles.")
+            raise InputError(
+                "the surface of the body is not closed: every edge must belong to two triangles."
+            )
         return cls(triangles, edges, beside)
 
     def silhouette(self, pixels: FloatArray) -> Silhouette:
@@ -144,7 +173,10 @@ class ClosedSurface:
             InputError: a vertex is behind the camera.
         """
         if not np.isfinite(pixels).all():
-            raise InputError("a part of the body is behind the camera: check the pose of the camera (world_to_camera).")
+            raise InputError(
+                "a part of the body is behind the camera: check the pose of the camera "
+                "(world_to_camera)."
+            )
         corners = pixels[self.triangles]
         first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         front = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0] < 0.0  # y points down
@@ -159,15 +191,20 @@ class ClosedSurface:
         outward = np.where(inwards[:, None], -across, across)
         count = np.maximum(np.ceil(length / _NEAR), 1).astype(int)
         owner = np.repeat(np.arange(len(ends)), count)
-        share = (np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[owner]
+        number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        share = (number + 0.5) / count[owner]
         points = pixels[ends[owner, 0]] + share[:, None] * line[owner]
         shapely.prepare(border)
         keep = shapely.dwithin(border, shapely.points(points), _ON)
         owner = owner[keep]
-        return Silhouette(ends[owner], share[keep], points[keep], outward[owner], (length / count)[owner])
+        return Silhouette(
+            ends[owner], share[keep], points[keep], outward[owner], (length / count)[owner]
+        )
 
     def region(self, pixels: FloatArray, chosen: Mask | slice = slice(None)) -> shapely.Geometry:
-        """Returns what the triangles, or some of them, cover of a picture, with their vertices at pixels (N, 2)."""
+        """Returns what the triangles, or some of them, cover of a picture,
+        with their vertices at pixels (N, 2).
+        """
         return shapely.union_all(shapely.polygons(pixels[self.triangles[chosen]]))
 
 
@@ -179,8 +216,8 @@ def within(points: FloatArray, size: tuple[int, int]) -> Mask:
 def visibility(points: FloatArray, hidden: FloatArray, margin: float) -> FloatArray:
     """(P,) how much points (P, 2) count beside others (V, 2) that a clamp hides [px].
 
-    It grows from zero at a margin around the convex hull of the hidden points to one at twice this margin, so that no
-    point appears at once.
+    It grows from zero at a margin around the convex hull of the hidden points to one at twice this
+    margin, so that no point appears at once.
     """
     if not len(hidden):
         return np.ones(len(points))

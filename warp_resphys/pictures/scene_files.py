@@ -1,12 +1,14 @@
-"""Pictures of a scene in a folder: places of their cameras, masks of the body, depths, tracked points, and scans.
+"""Pictures of a scene in a folder: places of their cameras,
+masks of the body, depths, tracked points, and scans.
 
-A scene's `camera.json` has `frames`, each with an `image` (a file beside it), `world_to_camera` (4 x 4, row-major,
-metres; camera axes: x right, y down, z forward) and perhaps a `mask`, a file whose pixels are bright where the body is,
-a `depth` image, the name of its `lens` and its `time` [s]; perhaps `frame_rate` [Hz], which gives the times of frames
-by their number; perhaps `fixed`, a list of clamps with the numbers of their `vertices`; and perhaps `world_to_cloud`,
-the same matrix for the axes of a scan. docs/pictures.md has an example. Tracked points are
-tables of DeepLabCut, or any with the columns `frame`, `tip.x` and `tip.y`, or files of NumPy with the arrays `tracks`
-(T, M, 2) and perhaps `visibility` (T, M), as those of CoTracker.
+A scene's `camera.json` has `frames`, each with an `image` (a file beside it), `world_to_camera` (4
+x 4, row-major, metres; camera axes: x right, y down, z forward) and perhaps a `mask`, a file whose
+pixels are bright where the body is, a `depth` image, the name of its `lens` and its `time` [s];
+perhaps `frame_rate` [Hz], which gives the times of frames by their number; perhaps `fixed`, a list
+of clamps with the numbers of their `vertices`; and perhaps `world_to_cloud`, the same matrix for
+the axes of a scan. docs/pictures.md has an example. Tracked points are tables of DeepLabCut, or any
+with the columns `frame`, `tip.x` and `tip.y`, or files of NumPy with the arrays `tracks` (T, M, 2)
+and perhaps `visibility` (T, M), as those of CoTracker.
 """
 
 import json
@@ -42,23 +44,28 @@ _PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 
 
 def colour_mask(image: NDArray[np.uint8], colours: ColourSettings) -> Mask:
-    """Returns the largest connected part of a picture (H, W, 3) with the colours of a body, its holes filled.
+    """Returns the largest connected part of a picture (H, W, 3)
+    with the colours of a body, its holes filled.
 
     Raises:
         InputError: no part has these colours.
     """
     hue, saturation, value = np.moveaxis(rgb_to_hsv(image[..., :3] / 255.0), -1, 0)
     first, last = colours.hue
-    right = (360.0 * hue - first) % 360.0 <= ((last - first) % 360.0 if last - first < 360.0 else 360.0)
+    right = (360.0 * hue - first) % 360.0 <= (
+        (last - first) % 360.0 if last - first < 360.0 else 360.0
+    )
     right &= (saturation >= colours.saturation) & (value >= colours.value)
     parts, count = scipy.ndimage.label(scipy.ndimage.binary_opening(right, iterations=_SPECKS))
     if not count:
         raise InputError(
-            f"no part has a hue from {first:g} to {last:g} degrees, a saturation of {colours.saturation:g} and a "
-            f"value of {colours.value:g}: widen the colours of the mask."
+            f"no part has a hue from {first:g} to {last:g} degrees, a saturation of "
+            f"{colours.saturation:g} and a value of {colours.value:g}: "
+            "widen the colours of the mask."
         )
     largest = parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
-    whole = scipy.ndimage.binary_dilation(largest, iterations=_SPECKS, mask=right)  # with its corners
+    # With its corners.
+    whole = scipy.ndimage.binary_dilation(largest, iterations=_SPECKS, mask=right)
     return np.asarray(scipy.ndimage.binary_fill_holes(whole))
 
 
@@ -134,26 +141,36 @@ def read_scene(path: Path, scanned: bool = False) -> SceneFile:
         content = json.loads(read_text(path)) if path.exists() or not scanned else {}
         scene = parse(_Scene, content if isinstance(content, dict) else {})
     except json.JSONDecodeError as error:
-        raise DataFileError(f"{path} is no JSON ({error}): write the cameras of its pictures anew.") from error
+        raise DataFileError(
+            f"{path} is no JSON ({error}): write the cameras of its pictures anew."
+        ) from error
     except InputError as error:
         raise DataFileError(f"{path}: {error}") from None
     if not (scene.frames or scanned):
-        raise DataFileError(f"{path} has no list 'frames': give an entry for every picture (docs/pictures.md).")
+        raise DataFileError(
+            f"{path} has no list 'frames': give an entry for every picture (docs/pictures.md)."
+        )
     frames = []
     for number, entry in enumerate(scene.frames):
         image = entry.image or entry.depth
         if image is None:
-            raise DataFileError(f"{path}: frame {number} has no 'image', the name of a file beside it.")
-        mask, depth = (None if name is None else path.parent / name for name in (entry.mask, entry.depth))
+            raise DataFileError(
+                f"{path}: frame {number} has no 'image', the name of a file beside it."
+            )
+        mask, depth = (
+            None if name is None else path.parent / name for name in (entry.mask, entry.depth)
+        )
         pose = None if entry.world_to_camera is None else _rigid(entry.world_to_camera, path)
         time = number / scene.frame_rate if entry.time is None and scene.frame_rate else entry.time
         frames.append(Frame(number, path.parent / image, pose, mask, depth, entry.lens, time))
     clamps = tuple(np.array(clamp.vertices) for clamp in scene.fixed)
-    return SceneFile(path, tuple(frames), clamps, _rigid(scene.world_to_cloud or np.eye(4).tolist(), path))
+    return SceneFile(
+        path, tuple(frames), clamps, _rigid(scene.world_to_cloud or np.eye(4).tolist(), path)
+    )
 
 
 def _rigid(pose: Sequence[Sequence[float]], path: Path) -> FloatArray:
-    """Returns a pose (4, 4) of a file, refused by the camera that has it if it is no rigid motion."""
+    """A pose (4, 4) of a file, refused by the camera that has it if it is no rigid motion."""
     try:
         return np.asarray(PlacedCamera(None, torch.tensor(pose, dtype=torch.float64)).pose.numpy())
     except InputError as error:
@@ -168,31 +185,37 @@ def check_times(scene: SceneFile, release: float) -> None:
         release: time of the release [s].
 
     Raises:
-        DataFileError: frames have no times, these do not increase, or fewer than three are after the release.
+        DataFileError: frames have no times, these do not increase, or fewer than three are after
+            the release.
     """
     last: dict[str, tuple[int, float]] = {}
     for frame in scene.frames:
         if frame.time is None:
             raise DataFileError(
-                f"{scene.path}: frame {frame.number} has no 'time', and its body is released: give it in s, or the "
-                "'frame_rate' of all frames in Hz."
+                f"{scene.path}: frame {frame.number} has no 'time', and its body is released: "
+                "give it in s, or the 'frame_rate' of all frames in Hz."
             )
         before = last.get(frame.lens)
         if before is not None and not frame.time > before[1]:
             raise DataFileError(
-                f"{scene.path}: frame {frame.number} has the time {frame.time:g} s, and frame {before[0]} before it "
-                f"{before[1]:g} s: the times of a camera must increase."
+                f"{scene.path}: frame {frame.number} has the time {frame.time:g} s, and frame "
+                f"{before[0]} before it {before[1]:g} s: the times of a camera must increase."
             )
         last[frame.lens] = (frame.number, frame.time)
-    if sum(frame.time is not None and frame.time > release for frame in scene.frames) < _LEAST_MOVING:
+    if (
+        sum(frame.time is not None and frame.time > release for frame in scene.frames)
+        < _LEAST_MOVING
+    ):
         raise DataFileError(
-            f"{scene.path} has fewer than {_LEAST_MOVING} different frames after the release at {release:g} s: check "
-            "the times, the release (data.poses) and the chosen frames, or leave the release out of a body at rest."
+            f"{scene.path} has fewer than {_LEAST_MOVING} different frames after the release at "
+            f"{release:g} s: check the times, the release (data.poses) and the chosen frames, or "
+            "leave the release out of a body at rest."
         )
 
 
 def read_picture(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
-    """Reads a picture (H, W, 3), red, green and blue, as it is meant to be seen, or in another mode of Pillow.
+    """Reads a picture (H, W, 3), red, green and blue,
+    as it is meant to be seen, or in another mode of Pillow.
 
     Raises:
         DataFileError: it is missing or no picture.
@@ -214,10 +237,12 @@ def read_mask(frame: Frame, colours: ColourSettings | None) -> Mask:
     if frame.mask is not None:
         drawn = read_picture(frame.mask, "RGBA")
         bright = np.minimum(drawn[..., :3].max(-1), 255 * (drawn[..., 3] > 127))
-        return np.asarray(bright > 0.5 * bright.max(initial=1))  # as masks are 0 and 1, or 0 and 255, or JPEG
+        # As masks are 0 and 1, or 0 and 255, or JPEG.
+        return np.asarray(bright > 0.5 * bright.max(initial=1))
     if colours is None:
         raise DataFileError(
-            f"{frame.image} has no mask: name one in camera.json, or give the colours of the body in data.mask."
+            f"{frame.image} has no mask: name one in camera.json, or give the colours of the "
+            "body in data.mask."
         )
     try:
         return colour_mask(read_picture(frame.image), colours)
@@ -226,10 +251,13 @@ def read_mask(frame: Frame, colours: ColourSettings | None) -> Mask:
 
 
 def read_depth(path: Path, unit: float) -> FloatArray:
-    """Reads a depth image (H, W), along the axis of the lens [m]; zero or not finite where there is none.
+    """Reads a depth image (H, W), along the axis of the lens [m].
+
+    Zero or not finite where there is none.
 
     Args:
-        path: of a picture of 16-bit integers, or of a .npy file, in metres where its numbers are no integers.
+        path: of a picture of 16-bit integers, or of a .npy file, in metres where its numbers are no
+            integers.
         unit: length that an integer stands for [m].
 
     Raises:
@@ -244,13 +272,19 @@ def read_depth(path: Path, unit: float) -> FloatArray:
         except (OSError, UnidentifiedImageError) as error:
             raise DataFileError(f"cannot read the depth image {path} ({error}).") from error
         if values.dtype == np.uint8:
-            raise DataFileError(f"{path} has 8 bits: write depths as a PNG of 16-bit integers, or as .npy in m.")
+            raise DataFileError(
+                f"{path} has 8 bits: write depths as a PNG of 16-bit integers, or as .npy in m."
+            )
     if values.ndim != 2 or values.dtype.kind not in "iuf":
-        raise DataFileError(f"{path} has the shape {values.shape}: a depth image has one number at each pixel.")
+        raise DataFileError(
+            f"{path} has the shape {values.shape}: a depth image has one number at each pixel."
+        )
     return np.asarray(values, dtype=np.float64) * (1.0 if values.dtype.kind == "f" else unit)
 
 
-def read_tracked(path: Path, names: Sequence[str], least: float, frames: Sequence[int]) -> FloatArray:
+def read_tracked(
+    path: Path, names: Sequence[str], least: float, frames: Sequence[int]
+) -> FloatArray:
     """Reads the pixels (F, M, 2) of M points in F frames, NaN where one was not seen.
 
     Args:
@@ -267,7 +301,9 @@ def read_tracked(path: Path, names: Sequence[str], least: float, frames: Sequenc
             arrays = read_arrays(path)
             tracks = np.asarray(arrays["tracks"], dtype=np.float64)
             if tracks.ndim != 3 or tracks.shape[1:] != (len(names), 2):
-                raise ValueError(f"its tracks have the shape {tracks.shape}, not (frames, {len(names)}, 2)")
+                raise ValueError(
+                    f"its tracks have the shape {tracks.shape}, not (frames, {len(names)}, 2)"
+                )
             sure = np.asarray(arrays.get("visibility", np.ones(tracks.shape[:2])), dtype=np.float64)
             tracks = np.where(sure.reshape(*tracks.shape[:2], 1) >= least, tracks, np.nan)
             rows = dict(enumerate(tracks))
@@ -288,17 +324,30 @@ def _table(path: Path, names: Sequence[str], least: float) -> dict[int, FloatArr
         of_head = {row[0]: row for row in rows[: len(_HEADS)] if row[0] in _HEADS}
         parts = of_head["bodyparts"]
         if len({*of_head.get("individuals", ["", ""])[1:]}) > 1:  # several animals
-            parts = [f"{animal}.{part}" for animal, part in zip(of_head["individuals"], parts, strict=True)]
-        heads = ["frame", *(f"{part}.{axis}" for part, axis in zip(parts[1:], of_head["coords"][1:], strict=True))]
+            parts = [
+                f"{animal}.{part}"
+                for animal, part in zip(of_head["individuals"], parts, strict=True)
+            ]
+        heads = [
+            "frame",
+            *(
+                f"{part}.{axis}"
+                for part, axis in zip(parts[1:], of_head["coords"][1:], strict=True)
+            ),
+        ]
         first = len(of_head)
     if heads[0] != "frame":
         raise ValueError(f"its first column is '{heads[0]}', not 'frame'")
     if missing := [name for name in names if f"{name}.x" not in heads or f"{name}.y" not in heads]:
         there = dict.fromkeys(head.rpartition(".")[0] for head in heads[1:])
-        raise ValueError(f"it has no columns x and y of {listed(missing)}, but of {listed([*there])}")
+        raise ValueError(
+            f"it has no columns x and y of {listed(missing)}, but of {listed([*there])}"
+        )
     result = {}
     for row in rows[first:]:
-        values = {head: float(cell) if cell else np.nan for head, cell in zip(heads, row, strict=True)}
+        values = {
+            head: float(cell) if cell else np.nan for head, cell in zip(heads, row, strict=True)
+        }
         points = np.array([[values[f"{name}.x"], values[f"{name}.y"]] for name in names])
         sure = np.array([values.get(f"{name}.likelihood", 1.0) for name in names])
         result[int(values["frame"])] = np.where(sure[:, None] >= least, points, np.nan)
@@ -306,9 +355,12 @@ def _table(path: Path, names: Sequence[str], least: float) -> dict[int, FloatArr
 
 
 def read_scan(path: str | Path, unit: float, seed: int = 0) -> tuple[FloatArray, FloatArray | None]:
-    """Reads the points (P, 3) of a scan [m], and its outer unit normals (P, 3); None without triangles.
+    """Reads the points (P, 3) of a scan [m], and its outer unit normals (P, 3).
 
-    Of a surface of triangles, points are spread evenly over these, which must be counter-clockwise from outside.
+    None without triangles.
+
+    Of a surface of triangles, points are spread evenly over these, which must be counter-clockwise
+    from outside.
 
     Args:
         path: the file; its extension determines the format.
@@ -334,7 +386,8 @@ def read_scan(path: str | Path, unit: float, seed: int = 0) -> tuple[FloatArray,
             points = np.asarray(read.vertices, dtype=np.float64)
             if isinstance(read, trimesh.Trimesh) and len(read.faces):
                 points, faces = trimesh.sample.sample_surface(read, _SAMPLED, seed=seed)
-                points, normals = np.asarray(points, dtype=np.float64), np.asarray(read.face_normals[faces])
+                points = np.asarray(points, dtype=np.float64)
+                normals = np.asarray(read.face_normals[faces])
         else:
             known = ", ".join((".npy", ".pcd", *_READ_BY_TRIMESH))
             raise ValueError(f"its extension is none of {known}")
@@ -343,10 +396,14 @@ def read_scan(path: str | Path, unit: float, seed: int = 0) -> tuple[FloatArray,
     except DataFileError:
         raise
     except Exception as error:  # readers raise all kinds of errors on damaged files
-        raise DataFileError(f"cannot read a scan from {path} ({error}): export it as .ply again.") from error
+        raise DataFileError(
+            f"cannot read a scan from {path} ({error}): export it as .ply again."
+        ) from error
     seen = np.isfinite(points).all(1)
     if not seen.any():
-        raise DataFileError(f"{path} has no points: scan again, or leave data.poses.NAME.cloud out.")
+        raise DataFileError(
+            f"{path} has no points: scan again, or leave data.poses.NAME.cloud out."
+        )
     return unit * points[seen], None if normals is None else normals[seen]
 
 
@@ -360,7 +417,10 @@ def _pcd(path: Path) -> FloatArray:
     counts = [int(count) for count in head.get("COUNT", ["1"] * len(head["FIELDS"]))]
     if head["DATA"] == ["ascii"]:
         column = dict(zip(head["FIELDS"], np.cumsum([0, *counts]), strict=False))
-        rows = np.array([line.split() for line in content[start:].decode("ascii").splitlines() if line], dtype=float)
+        rows = np.array(
+            [line.split() for line in content[start:].decode("ascii").splitlines() if line],
+            dtype=float,
+        )
         return np.asarray(rows[:, [column[axis] for axis in "xyz"]])
     if head["DATA"] != ["binary"]:
         raise ValueError(f"its data are {' '.join(head['DATA'])}, and must be ascii or binary")

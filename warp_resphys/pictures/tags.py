@@ -1,7 +1,8 @@
 """World-to-camera poses from the picture of one small square tag (ArUco or AprilTag), by OpenCV.
 
-Two poses fit the picture of a small square nearly as well (Collins and Bartoli 2014): both are returned, the better one
-first. `tests/pictures/test_tags.py` compares with tags drawn at known poses.
+Two poses fit the picture of a small square nearly as well (Collins and Bartoli 2014): both are
+returned, the better one first. `tests/pictures/test_tags.py` compares with tags drawn at known
+poses.
 """
 
 from typing import Final
@@ -19,19 +20,28 @@ _CORNERS: Final = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0],
 
 
 def tag_poses(tag: TagSettings, image: NDArray[np.uint8], lens: Lens) -> list[FloatArray]:
-    """Returns the one or two world_to_camera (4, 4) that a picture (H, W, 3) allows; none without the tag.
+    """Returns the one or two world_to_camera (4, 4) that a picture (H, W, 3) allows.
+
+    None without the tag.
 
     Raises:
-        InputError: OpenCV is not installed, or has no such dictionary; or the edges are not perpendicular.
+        InputError: OpenCV is not installed, or has no such dictionary; or the edges are not
+            perpendicular.
     """
     with needs_extra("tags", "data.tag needs"):
         import cv2
     constant = getattr(cv2.aruco, f"DICT_{tag.dictionary.upper()}", None)
     if constant is None:
-        raise InputError(f"OpenCV has no tags {tag.dictionary!r}: choose one such as 6x6_250 or apriltag_36h11.")
+        raise InputError(
+            f"OpenCV has no tags {tag.dictionary!r}: choose one such as 6x6_250 or apriltag_36h11."
+        )
     right, up = np.array(tag.right), np.array(tag.up)
-    if not abs(right @ up) <= 1e-3 * np.linalg.norm(right) * np.linalg.norm(up) or not (right.any() and up.any()):
-        raise InputError("right and up of a tag are directions of two of its edges: they must be perpendicular.")
+    if not abs(right @ up) <= 1e-3 * np.linalg.norm(right) * np.linalg.norm(up) or not (
+        right.any() and up.any()
+    ):
+        raise InputError(
+            "right and up of a tag are directions of two of its edges: they must be perpendicular."
+        )
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     dictionary = cv2.aruco.getPredefinedDictionary(constant)

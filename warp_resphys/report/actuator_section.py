@@ -1,6 +1,8 @@
-"""The section on the learned actuator: whether it is used, and what acts under commands that rise and fall.
+"""The section on the learned actuator: whether it is used,
+and what acts under commands that rise and fall.
 
-A Gaussian process of the inputs changes them (`data.input_network`). Parts that no trial drives are left out.
+A Gaussian process of the inputs changes them (`data.input_network`). Parts that no trial drives are
+left out.
 """
 
 from typing import Final
@@ -22,27 +24,40 @@ _MOST: Final = 12  # parts that are drawn
 
 
 def actuator_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Returns the curves of the inputs that act over the commands; None where no actuator was learned."""
+    """Returns the curves of the inputs that act over the commands.
+
+    None where no actuator was learned.
+    """
     driven = data.driven
     if driven is None or driven.quantity.name not in data.actuator:
         return None
-    tests = [fold["networks"]["actuator"]["test"] for fold in folds_in(data.metrics) if "actuator" in fold["networks"]]
+    tests = [
+        fold["networks"]["actuator"]["test"]
+        for fold in folds_in(data.metrics)
+        if "actuator" in fold["networks"]
+    ]
     test = next((test for test in tests if test is not None), None)
     said = "It was not tested on held-out trials." if test is None else f"Tested {text_of(test)}."
     if test is not None and not test["used"]:
         said += " So it is not used."
     words, filters = driven.quantity.plural, data.actuator[driven.quantity.name].filters
-    means = f" and their exponential means over {in_a_row([f'{time:g} s' for time in filters])}" if filters else ""
+    means = (
+        f" and their exponential means over {in_a_row([f'{time:g} s' for time in filters])}"
+        if filters
+        else ""
+    )
     text = (
-        f"A Gaussian process changes the {words} of the identified response. It takes all {words}{means}, and was "
-        f"trained through the simulator. {said}"
+        f"A Gaussian process changes the {words} of the identified response. It takes all "
+        f"{words}{means}, and was trained through the simulator. {said}"
     )
     blocks: list[Block] = [Text(unbroken(text)), *_curves(data, driven, canvas)]
     return Part("The learned actuator", blocks)
 
 
 def _curves(data: RunReport, driven: Driven, canvas: Canvas) -> list[Drawn]:
-    """Draws what acts in each part over its command, while the other parts have their mean commands."""
+    """Draws what acts in each part over its command,
+    while the other parts have their mean commands.
+    """
     quantity, used = driven.quantity, [*driven.used[:_MOST]]
     parts = [driven.channels[number] for number in used]
     commands, acting = (values[:, used] for values in risen_and_fallen(data, driven))
@@ -52,9 +67,23 @@ def _curves(data: RunReport, driven: Driven, canvas: Canvas) -> list[Drawn]:
     colour, muted = TONES["actuator"].light, TONES["muted"].light
     for number, (axes, part) in enumerate(zip(grid.flat, parts, strict=False)):
         x, y = (quantity.shown_factor * values[:, number] for values in (commands, acting))
-        axes.plot(x[:_STEPS], x[:_STEPS], color=muted, linewidth=1.0, linestyle=(0, (1, 2)), label="as commanded")
+        axes.plot(
+            x[:_STEPS],
+            x[:_STEPS],
+            color=muted,
+            linewidth=1.0,
+            linestyle=(0, (1, 2)),
+            label="as commanded",
+        )
         axes.plot(x[:_STEPS], y[:_STEPS], color=colour, linewidth=1.7, label="rising")
-        axes.plot(x[_STEPS:], y[_STEPS:], color=colour, linewidth=1.7, linestyle=(0, (4, 1.5)), label="falling")
+        axes.plot(
+            x[_STEPS:],
+            y[_STEPS:],
+            color=colour,
+            linewidth=1.7,
+            linestyle=(0, (4, 1.5)),
+            label="falling",
+        )
         axes.set_title(part.replace("_", " "), loc="left", fontsize="medium")
     for axes in grid.flat[len(parts) :]:
         axes.set_axis_off()
@@ -70,14 +99,23 @@ def _curves(data: RunReport, driven: Driven, canvas: Canvas) -> list[Drawn]:
     )
     words = quantity.words[:1].upper() + quantity.words[1:]
     caption = (
-        f"{words} that acts in each part while its command rises to the largest one of the trials in {_SECONDS:g} s "
-        "and falls again; the other parts have their mean commands."
+        f"{words} that acts in each part while its command rises to the largest one of the "
+        f"trials in {_SECONDS:g} s and falls again; the other parts have their mean commands."
     )
-    return [canvas.figure("actuator", figure, unbroken(f"{words} that acts over the commanded one. {ends}."), caption)]
+    return [
+        canvas.figure(
+            "actuator",
+            figure,
+            unbroken(f"{words} that acts over the commanded one. {ends}."),
+            caption,
+        )
+    ]
 
 
 def risen_and_fallen(data: RunReport, driven: Driven) -> tuple[FloatArray, FloatArray]:
-    """Returns commands (T, C) of each part, which rise and fall one after the other, and what acts in that part."""
+    """Returns commands (T, C) of each part, which rise and fall one after the other,
+    and what acts in that part.
+    """
     trials = np.concatenate([*driven.values.values()])
     high, mean, count = trials.max(0), trials.mean(0), trials.shape[1]
     ramp = np.linspace(0.0, 1.0, _STEPS)

@@ -23,11 +23,23 @@ from ..mesh.surface import closest_points
 from ..mesh.volume_mesh import Mesh, boundary_triangles, face_triangles
 from .data import Recordings
 from .figures import CHAMBER_COLOURS, WIDE, in_style
-from .layers import INK, MEASURED, Layer, RenderScene, View, chain, face_edges, obstacle_layers, sharp_edges, stems
+from .layers import (
+    INK,
+    MEASURED,
+    Layer,
+    RenderScene,
+    View,
+    chain,
+    face_edges,
+    obstacle_layers,
+    sharp_edges,
+    stems,
+)
 from .render import Pixels, Renderer, draw
 
 TOWARDS_VIEWER: Final = (0.32, -1.0, 0.28)
-_SIDES: Final = {"From above": TOWARDS_VIEWER, "From the side": (0.0, -1.0, 0.0)}  # Towards the viewer.
+# Towards the viewer.
+_SIDES: Final = {"From above": TOWARDS_VIEWER, "From the side": (0.0, -1.0, 0.0)}
 _CUT: Final = "#d3dde7"
 NOMINAL: Final = "#0072b2"  # Blue of Okabe and Ito (2008).
 _LIFT: Final = 2e-3  # Height of lines above their surface, over the body's longest side.
@@ -61,7 +73,9 @@ class MeshSummary:
 
 @dataclass(frozen=True, eq=False)
 class BodyPicture:
-    """Views of a body side by side, of the width of all figures, with titles above and a legend below."""
+    """Views of a body side by side, of the width of all figures,
+    with titles above and a legend below.
+    """
 
     scene: RenderScene
     titles: Sequence[str]  # One a view.
@@ -89,7 +103,11 @@ class BodyPicture:
         if self.handles:
             figure.legend(handles=self.handles, loc="lower center", ncols=columns, frameon=False)
         for text, place, left in self.notes:
-            beside: dict[str, Any] = {"textcoords": "offset points", "ha": "right" if left else "left", "va": "center"}
+            beside: dict[str, Any] = {
+                "textcoords": "offset points",
+                "ha": "right" if left else "left",
+                "va": "center",
+            }
             outline = [withStroke(linewidth=2.5, foreground="white")]
             panel.annotate(text, place, (-9 if left else 9, 0), path_effects=outline, **beside)
         with atomic_path(path) as target:
@@ -98,7 +116,9 @@ class BodyPicture:
 
 
 def mesh_picture(summary: MeshSummary, markers: FloatArray | None = None) -> BodyPicture:
-    """Returns a body from outside and cut open; and translucent, with chambers and tendons in colours, if it has any.
+    """Returns a body from outside and cut open.
+
+    And translucent, with chambers and tendons in colours, if it has any.
 
     Markers (M, 3) [m] are dots in the uncut views.
     """
@@ -111,23 +131,33 @@ def mesh_picture(summary: MeshSummary, markers: FloatArray | None = None) -> Bod
     views = [View(layers, axes, focus, half[1]) for layers in _layers(summary, dots, _line(size))]
     labels = [
         chamber.name.replace("_", " ")
-        + ("" if len(chamber.edges) else f": {_CUBIC_CENTI * summary.chamber_volume(chamber):.1f} cm³")
+        + (
+            ""
+            if len(chamber.edges)
+            else f": {_CUBIC_CENTI * summary.chamber_volume(chamber):.1f} cm³"
+        )
         for chamber in summary.chambers
     ]
     labels += [name.replace("_", " ") for name in summary.tendons]
-    handles = [Patch(color=tone, label=label) for label, tone in zip(labels, cycle(CHAMBER_COLOURS), strict=False)]
+    handles = [
+        Patch(color=tone, label=label)
+        for label, tone in zip(labels, cycle(CHAMBER_COLOURS), strict=False)
+    ]
     titles = ["Outside", "Cut open", summary.inside][: len(views)]
     return BodyPicture(RenderScene(views, size, background="white", sorts=True), titles, handles)
 
 
 def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list[Layer]]:
-    """Layers of the body from outside, of its half behind a plane along it, and of what is in the translucent body.
+    """Layers of the body from outside, of its half behind a plane along it,
+    and of what is in the translucent body.
 
     Markers are (M, 3) [m]; a thin line has a width of `line` [px].
     """
     mesh, triangles = summary.mesh, boundary_triangles(summary.mesh)
     vertices, size = mesh.vertices, float(np.ptp(mesh.vertices, axis=0).max())
-    chambers = list(zip((face_triangles(chamber.faces) for chamber in summary.chambers), cycle(CHAMBER_COLOURS)))
+    chambers = list(
+        zip((face_triangles(chamber.faces) for chamber in summary.chambers), cycle(CHAMBER_COLOURS))
+    )
     inner = np.concatenate([np.empty(0, dtype=np.int64), *(faces.ravel() for faces, _ in chambers)])
     outer = triangles[~np.isin(triangles[:, 0], inner)]
     normal = np.array(TOWARDS_VIEWER)
@@ -136,7 +166,9 @@ def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list
     solid = mesh.cells[:, : ELEMENTS[mesh.element.linear].nodes]
     lift, bright, cut_light = _LIFT * size, (0.6, 0.6), (0.55, 0.6)
     balls = Layer("balls", markers, None, MEASURED, size=_DOT * size, light=(0.6, 0.5))
-    clamped = Layer("balls", vertices[summary.fixed], None, FIXED, size=0.5 * _DOT * size, light=(0.7, 0.3))
+    clamped = Layer(
+        "balls", vertices[summary.fixed], None, FIXED, size=0.5 * _DOT * size, light=(0.7, 0.3)
+    )
     dots = [balls] if len(markers) else []
     outside = [
         Layer("surface", vertices, triangles, BODY, light=bright),
@@ -149,13 +181,18 @@ def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list
         Layer("surface", vertices, outer, BODY, light=cut_light, plane=plane),
         Layer("slice", vertices, solid, _CUT, light=(0.93, 0.12), plane=plane),
         Layer("slice_edges", vertices, solid, size=line, opacity=0.55, shift=lift, plane=plane),
-        *(Layer("surface", vertices, faces, colour, light=cut_light, plane=plane) for faces, colour in chambers),
+        *(
+            Layer("surface", vertices, faces, colour, light=cut_light, plane=plane)
+            for faces, colour in chambers
+        ),
     ]
     inside = [
         *(Layer("surface", vertices, faces, colour, light=bright) for faces, colour in chambers),
         *(
             Layer("lines", guides, chain(len(guides)), colour, size=_ROPE * line)
-            for guides, colour in zip(summary.tendons.values(), cycle(CHAMBER_COLOURS[len(chambers) :]))
+            for guides, colour in zip(
+                summary.tendons.values(), cycle(CHAMBER_COLOURS[len(chambers) :])
+            )
         ),
         *dots,
     ]
@@ -167,16 +204,19 @@ def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list
 
 
 def registration_picture(recordings: Recordings, fixed: IntArray) -> BodyPicture:
-    """Returns a translucent body, its measured markers on stems, and rings at their nominal positions, from two sides.
+    """Returns a translucent body, its measured markers on stems, and rings at their nominal
+    positions, from two sides.
 
-    Lines connect rings with the markers outside of them. Names and residuals of these markers, and of those that were
-    left out of the fit, are written beside them. The trial that fits worst is drawn, without markers that were not
-    seen, and with the clamped region of fixed vertices.
+    Lines connect rings with the markers outside of them. Names and residuals of these markers, and
+    of those that were left out of the fit, are written beside them. The trial that fits worst is
+    drawn, without markers that were not seen, and with the clamped region of fixed vertices.
     """
     mesh, fit = recordings.mesh, recordings.registered[recordings.worst]
     labels = [label for label in fit["positions"] if label in recordings.nominal]
     # Markers that were not seen are null in JSON.
-    markers = np.array([fit["positions"][label] or (None,) * 3 for label in labels], dtype=np.float64)
+    markers = np.array(
+        [fit["positions"][label] or (None,) * 3 for label in labels], dtype=np.float64
+    )
     nominal = np.stack([recordings.nominal[label] for label in labels])
     radius = _DOT * float(np.ptp(mesh.vertices, axis=0).max())
     ends = np.concatenate([markers, nominal])
@@ -185,34 +225,49 @@ def registration_picture(recordings: Recordings, fixed: IntArray) -> BodyPicture
     seen, line = np.isfinite(markers).all(axis=1), _line(size)
     away = seen & (np.linalg.norm(markers - nominal, axis=1) > _RING * radius)
     standing = np.isin(labels, [*recordings.beside])[seen, None]
-    feet = np.where(standing, markers[seen], closest_points(mesh, markers[seen]).points) if seen.any() else nominal[:0]
+    feet = (
+        np.where(standing, markers[seen], closest_points(mesh, markers[seen]).points)
+        if seen.any()
+        else nominal[:0]
+    )
     layers = [
         *_translucent(mesh, fixed, line, radius),
         Layer("rings", nominal, None, NOMINAL, size=_RING * radius, shift=4.0 * radius),
         *([stems(feet, markers[seen], INK, 3.0 * line)] if seen.any() else []),
-        *([Layer("balls", markers[seen], None, MEASURED, size=radius, light=(0.72, 0.41))] if seen.any() else []),
+        *(
+            [Layer("balls", markers[seen], None, MEASURED, size=radius, light=(0.72, 0.41))]
+            if seen.any()
+            else []
+        ),
         *([stems(nominal[away], markers[away], NOMINAL, 2.0 * line)] if away.any() else []),
     ]
     none: dict[str, Any] = {"linestyle": "none", "marker": "o"}
     handles = [
         Line2D([], [], **none, color=MEASURED, label="measured"),
-        Line2D([], [], **none, color=NOMINAL, markerfacecolor="none", markersize=9, label="nominal"),
+        Line2D(
+            [], [], **none, color=NOMINAL, markerfacecolor="none", markersize=9, label="nominal"
+        ),
         *([Patch(color=FIXED, label="clamped")] if len(fixed) else []),
     ]
     outlying, notes = np.isin(labels, fit["outliers"]), []
     for at, (axes, focus) in enumerate(placed):
-        across, up = ((markers - focus) @ axes[:2].T).T / half[1] * (0.5 * size[1])  # [px] from the middle.
+        # [px] from the middle.
+        across, up = ((markers - focus) @ axes[:2].T).T / half[1] * (0.5 * size[1])
         for marker in np.flatnonzero(away | (seen & outlying)):
             name = f"{labels[marker]}: {fit['residual_mm'][labels[marker]]:.2f} mm"
             name += ", left out" if outlying[marker] else ""
             place = (size[0] * (at + 0.5) + across[marker], 0.5 * size[1] - up[marker])
             notes.append((name, place, bool(across[marker] > 0.0)))
     views = [View(layers, axes, focus, half[1]) for axes, focus in placed]
-    return BodyPicture(RenderScene(views, size, background="white", sorts=True), [*_SIDES], handles, notes)
+    return BodyPicture(
+        RenderScene(views, size, background="white", sorts=True), [*_SIDES], handles, notes
+    )
 
 
 def _translucent(mesh: Mesh, fixed: IntArray, line: float, radius: float) -> list[Layer]:
-    """Layers of a translucent body with its clamped region, and lines of a width [px] around its faces."""
+    """Layers of a translucent body with its clamped region,
+    and lines of a width [px] around its faces.
+    """
     q, triangles = mesh.vertices, boundary_triangles(mesh)
     layers = [
         Layer("surface", q, triangles, BODY, opacity=0.42, light=(0.78, 0.28)),
@@ -221,14 +276,18 @@ def _translucent(mesh: Mesh, fixed: IntArray, line: float, radius: float) -> lis
     if len(sharp := sharp_edges(q, triangles)):
         layers.append(Layer("lines", q, sharp, FIXED, opacity=0.75, size=1.8 * line))
     if len(clamped := triangles[np.isin(triangles, fixed).all(axis=1)]):
-        layers.append(Layer("surface", q, clamped, FIXED, opacity=0.75, light=(0.7, 0.22), shift=0.1 * radius))
+        layers.append(
+            Layer("surface", q, clamped, FIXED, opacity=0.75, light=(0.7, 0.22), shift=0.1 * radius)
+        )
     return layers
 
 
 def _framed(
     points: FloatArray, towards_viewer: Sequence[Sequence[float]]
 ) -> tuple[list[tuple[FloatArray, FloatArray]], FloatArray, list[int]]:
-    """Axes and middle of each view of points (P, 3), half the width and height (2,) of all [m], and their size [px]."""
+    """Axes and middle of each view of points (P, 3),
+    half the width and height (2,) of all [m], and their size [px].
+    """
     turned = [view_axes(towards) for towards in towards_viewer]
     frames = [frame_of(points, axes, _MARGIN) for axes in turned]
     half = np.max([size for _, size in frames], axis=0)

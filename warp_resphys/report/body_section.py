@@ -21,7 +21,8 @@ _DRAWN: Final = (*BASELINES, "simulation", "sysid", "law", "actuator", "simfree"
 _CALIBRATED: Final = {  # Source of prediction intervals.
     "validation": "the errors in the validation trials",
     "training": "the errors in the training trials, which tend to be too small",
-    "left_out": "the errors in the training trials, with the parameters, but no network, learned without each of them",
+    "left_out": "the errors in the training trials, with the parameters, but no network, learned "
+    "without each of them",
     "folds": "the errors of the other folds",
 }
 _MOST_MARKERS: Final = 6  # Markers whose coordinates are drawn.
@@ -29,11 +30,14 @@ _STILL: Final = 0.01  # Largest motion along an axis that is not drawn, over tha
 _LOWEST: Final = 2.2  # Least height of all panels [in].
 _MOST_DOTS: Final = 75  # Dots along a time axis.
 _BAND: Final = 0.16  # Opacity of prediction intervals.
-_LEAST_SPAN: Final = 0.08  # Least span of a coordinate's axis, over the largest motion of the trial.
+_LEAST_SPAN: Final = (
+    0.08  # Least span of a coordinate's axis, over the largest motion of the trial.
+)
 _LEGEND_ROW: Final = 4  # Largest number of names of chambers in one row.
 _BARS: Final = 0.8  # Height of a pose's bars, over the distance of poses.
 _SEQUENCES: Final = 3  # Trials whose inputs are drawn over time.
-_LIMIT: Final[dict[str, Any]] = {"linewidth": 1.0, "linestyle": (0, (4, 3))}  # Line of the largest allowed input.
+# Line of the largest allowed input.
+_LIMIT: Final[dict[str, Any]] = {"linewidth": 1.0, "linestyle": (0, (4, 3))}
 
 
 def body_section(data: RunReport, canvas: Canvas) -> Part | None:
@@ -43,25 +47,42 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
         return None
     quantity, markers = driven.quantity, len(trials.labels)
     parts = f"{len(driven.channels)} {quantity.per}{'s' if len(driven.channels) > 1 else ''}"
-    dots = f", and the {f'{markers} markers' if markers > 1 else 'marker'} as dots" if markers else ""
+    dots = (
+        f", and the {f'{markers} markers' if markers > 1 else 'marker'} as dots" if markers else ""
+    )
     dark = " Dark: clamped." if len(data.fixed) else ""
-    caption = f"The simulated body: {len(data.mesh.vertices)} vertices, {parts} under {quantity.words}{dots}.{dark}"
+    caption = (
+        f"The simulated body: {len(data.mesh.vertices)} vertices, {parts} under "
+        f"{quantity.words}{dots}.{dark}"
+    )
     alt = f"The body at rest from outside, cut open and translucent, with {parts} in colours."
 
     summary = MeshSummary(
-        data.mesh, data.fixed, data.chambers, data.tendons, f"{quantity.per}s".capitalize(), data.obstacles
+        data.mesh,
+        data.fixed,
+        data.chambers,
+        data.tendons,
+        f"{quantity.per}s".capitalize(),
+        data.obstacles,
     )
     picture = mesh_picture(summary, trials.bound if trials.labels else None)
     blocks: list[Block] = [
-        canvas.rendered("body.png", picture.draw, lambda path, drawn: Drawn.of(picture.save(path, drawn), alt, caption))
+        canvas.rendered(
+            "body.png",
+            picture.draw,
+            lambda path, drawn: Drawn.of(picture.save(path, drawn), alt, caption),
+        )
     ]
     rule = "" if not driven.limit else f"; dashed, the limit of {quantity.shown(driven.limit)}"
     left_out = f"; unused {quantity.per}s are left out" * (len(driven.used) < len(driven.channels))
     what, words = f"{quantity.plural.capitalize()} of {parts}", quantity.plural.capitalize()
     if over_time := input_sequences(driven, trials):
-        figure, shown = _sequences(driven, trials.time_step, over_time), f"{what} over time: {', '.join(over_time)}."
+        figure = _sequences(driven, trials.time_step, over_time)
+        shown = f"{what} over time: {', '.join(over_time)}."
         whose = "a few trials" if len(driven.values) > 1 else "the trial"
-        blocks.append(canvas.figure("inputs", figure, shown, unbroken(f"{words} of {whose}{left_out}{rule}.")))
+        blocks.append(
+            canvas.figure("inputs", figure, shown, unbroken(f"{words} of {whose}{left_out}{rule}."))
+        )
     if driven.poses:
         said = f"{words} of the poses; unused {quantity.per}s are left out{rule}."
         figure, shown = _poses(driven, trials.names), f"{what} by pose: {', '.join(driven.poses)}."
@@ -70,7 +91,9 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def input_sequences(driven: Driven, trials: TrialResults) -> dict[str, FloatArray]:
-    """Returns inputs of a few trials by the titles of their panels: test, training, and highest inputs."""
+    """Returns inputs of a few trials by the titles of their panels:
+    test, training, and highest inputs.
+    """
     values = {name: inputs for name, inputs in driven.values.items() if name not in driven.poses}
     test = [name for name in trials.names if name in values]
     others = [name for name in values if name not in test and name not in driven.scaled][:1]
@@ -97,13 +120,17 @@ def _sequences(driven: Driven, time_step: float, sequences: Mapping[str, FloatAr
 
 
 def _inputs(axes: Axes, times: FloatArray, rows: FloatArray, driven: Driven) -> None:
-    """Draws steps of the inputs (K, C) of used parts between K + 1 times [s], and the limit as a dashed line."""
+    """Draws steps of the inputs (K, C) of used parts between K + 1 times [s],
+    and the limit as a dashed line.
+    """
     colours = figures.CHAMBER_COLOURS
     for part in driven.used:
         values, colour = driven.quantity.shown_factor * rows[:, part], colours[part % len(colours)]
         axes.stairs(values, times, baseline=None, color=colour, linewidth=1.2)
     if driven.limit is not None:
-        axes.axhline(driven.quantity.shown_factor * driven.limit, color=TONES["muted"].light, **_LIMIT)
+        axes.axhline(
+            driven.quantity.shown_factor * driven.limit, color=TONES["muted"].light, **_LIMIT
+        )
     figures.few_ticks(axes.yaxis, 4)
 
 
@@ -112,8 +139,12 @@ def _input_label(axes: Axes, driven: Driven) -> None:
 
 
 def _poses(driven: Driven, tested: Sequence[str]) -> Figure:
-    """Draws the last inputs of each pose as bars beside its name; parts without inputs are left out."""
-    quantity, names = driven.quantity, [f"{name} (test)" if name in tested else name for name in driven.poses]
+    """Draws the last inputs of each pose as bars beside its name.
+
+    Parts without inputs are left out.
+    """
+    quantity = driven.quantity
+    names = [f"{name} (test)" if name in tested else name for name in driven.poses]
     values = quantity.shown_factor * np.stack([driven.values[name][-1] for name in driven.poses])
     used: Sequence[int] = np.flatnonzero(values.any(axis=0)).tolist() or driven.used
     count = len(used)
@@ -138,7 +169,10 @@ def _part_legend(figure: Figure, driven: Driven, used: Sequence[int]) -> None:
     """Draws a legend of the used parts below the figure."""
     colours = figures.CHAMBER_COLOURS
     handles: list[Any] = [
-        Line2D([], [], color=colours[at % len(colours)], label=driven.channels[at].replace("_", " ")) for at in used
+        Line2D(
+            [], [], color=colours[at % len(colours)], label=driven.channels[at].replace("_", " ")
+        )
+        for at in used
     ]
     if driven.limit is not None:
         handles.append(Line2D([], [], color=TONES["muted"].light, label="limit", **_LIMIT))
@@ -146,24 +180,37 @@ def _part_legend(figure: Figure, driven: Driven, used: Sequence[int]) -> None:
 
 
 def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Returns coordinates of the markers or the tip, in the trials of largest and least error, over the inputs."""
+    """Returns coordinates of the markers or the tip,
+    in the trials of largest and least error, over the inputs.
+    """
     trials, driven = data.trials, data.driven
     if trials is None or not trials.moves or not (trials.labels or len(data.tip)):
         return None
     trials, of = (trials, "markers") if trials.labels else (trials.of_tip(data.tip), "tip")
     rows, blocks = best_and_worst(trials), []
-    which = (("worst", "the last model of the table", "largest"), ("best", "the same model", "least"))
+    which = (
+        ("worst", "the last model of the table", "largest"),
+        ("best", "the same model", "least"),
+    )
     for row, (place, model, error) in zip(rows, which, strict=False):
-        name, target, shown = trials.names[row], trials.target[row], shown_markers(trials.target[row])
+        name = trials.names[row]
+        target = trials.target[row]
+        shown = shown_markers(trials.target[row])
         reach = np.nanmax(np.linalg.norm(target - trials.bound, axis=2), axis=0, initial=0.0)
         kept = np.sort(shown[np.argsort(-reach[shown])[:_MOST_MARKERS]]).tolist()
         models, start = [m for m in _DRAWN if m in trials.positions], trials.bound
-        caption = f"Trial {name}{f', in which {model} has its {error} error' if len(rows) > 1 else ''}: "
-        alt = f"Coordinates of the {of} over time in the trial {name}: observed as dots, the models as lines"
+        caption = (
+            f"Trial {name}{f', in which {model} has its {error} error' if len(rows) > 1 else ''}: "
+        )
+        alt = (
+            f"Coordinates of the {of} over time in the trial {name}: "
+            "observed as dots, the models as lines"
+        )
         if driven is None:
             caption += f"displacement of the {of} from the undeformed body."
         else:
-            words, start = driven.quantity.plural, np.where(np.isfinite(target[0]), target[0], trials.bound)
+            words = driven.quantity.plural
+            start = np.where(np.isfinite(target[0]), target[0], trials.bound)
             models = [m for m in models if m != "simulation"] or models
             caption += f"displacement of the markers from rest, and the {words} that drive it."
             alt += f"; below them the {words} of the {driven.quantity.per}s"
@@ -187,7 +234,8 @@ def marker_paths(
     bands: Mapping[str, FloatArray],
     driven: Driven | None = None,
 ) -> Figure:
-    """Draws coordinates of some markers of a trial, measured as dots, simulated as lines, and below them the inputs.
+    """Draws coordinates of some markers of a trial, measured as dots,
+    simulated as lines, and below them the inputs.
 
     Args:
         trials: Measured and simulated positions.
@@ -206,20 +254,38 @@ def marker_paths(
     reach = np.max([np.ptp(q, axis=0).max(axis=0) for q in drawn], axis=0)  # (3,) [mm]
     shown = [axis for axis in trials.axes if reach[axis] > _STILL * reach.max()] or [*trials.axes]
     figure = figures.new_figure(0.9 + max(1.25 * sum(ratios), _LOWEST))
-    panels = figure.subplots(len(ratios), len(shown), sharex=True, squeeze=False, height_ratios=ratios)
+    panels = figure.subplots(
+        len(ratios), len(shown), sharex=True, squeeze=False, height_ratios=ratios
+    )
     least = _LEAST_SPAN * float(np.ptp(np.nan_to_num(target), axis=0).max())
     every = -(-len(times) // _MOST_DOTS)
-    dots: dict[str, Any] = {"color": TONES["ink"].light, "markersize": 3.2, "zorder": 1.5, "label": "Observed"}
+    dots: dict[str, Any] = {
+        "color": TONES["ink"].light,
+        "markersize": 3.2,
+        "zorder": 1.5,
+        "label": "Observed",
+    }
     for marker, of_marker in enumerate(panels[: len(kept)]):
         for axes, axis in zip(of_marker, shown, strict=True):
             seen = target[:, marker, axis]
             axes.plot(times[::every], seen[::every], ".", **dots)
             for model, path in zip(models, paths, strict=True):
-                moved = np.where(np.abs(path[:, marker, axis]) < figures.LARGEST_SHOWN, path[:, marker, axis], np.nan)
+                moved = np.where(
+                    np.abs(path[:, marker, axis]) < figures.LARGEST_SHOWN,
+                    path[:, marker, axis],
+                    np.nan,
+                )
                 axes.plot(times, moved, **figures.model_line(model, 1.1))
                 if model in bands:
                     ends = [moved + sign * 1e3 * bands[model][:, marker] for sign in (-1.0, 1.0)]
-                    axes.fill_between(times, *ends, color=TONES[model].light, alpha=_BAND, linewidth=0.0, zorder=0.5)
+                    axes.fill_between(
+                        times,
+                        *ends,
+                        color=TONES[model].light,
+                        alpha=_BAND,
+                        linewidth=0.0,
+                        zorder=0.5,
+                    )
             figures.keep_in_view(axes, seen, 0.6, least)
             figures.few_ticks(axes.yaxis, 4)
         of_marker[0].set_ylabel(f"{trials.labels[kept[marker]]} [mm]")
@@ -238,13 +304,16 @@ def marker_paths(
 
 
 def _band_note(data: RunReport, bands: Mapping[str, FloatArray]) -> str:
-    """Sentence on the drawn band: its intended coverage, and its coverage and width in all test trials."""
+    """Sentence on the drawn band: its intended coverage,
+    and its coverage and width in all test trials.
+    """
     if not bands:
         return ""
     intervals = data.metrics["intervals"]
     (kept,) = (intervals["models"][model] for model in bands)
     return (
-        f" The band should contain {100.0 * intervals['level']:.0f} % of the measured coordinates, and contains "
-        f"{100.0 * kept['coverage']:.0f} % of them; it is ± {mm_text(kept['half_width_mm'])} wide on average, from "
+        f" The band should contain {100.0 * intervals['level']:.0f} % of the measured "
+        f"coordinates, and contains {100.0 * kept['coverage']:.0f} % of them; it is ± "
+        f"{mm_text(kept['half_width_mm'])} wide on average, from "
         f"{_CALIBRATED[intervals['calibrated_on']]}."
     )

@@ -1,8 +1,9 @@
-"""The conditions of a result: all that speaks against relying on it, as short lines in a fixed order.
+"""The conditions of a result: all that speaks against relying on it,
+as short lines in a fixed order.
 
-The order is that of `CONDITIONS`: coverage of the prediction intervals, parameters at bounds, trials beyond the
-training, the mesh, the registration, too few trials, and what was learned and is not used. Each line has a fact and
-what to do about it. None is left out because there are others.
+The order is that of `CONDITIONS`: coverage of the prediction intervals, parameters at bounds,
+trials beyond the training, the mesh, the registration, too few trials, and what was learned and is
+not used. Each line has a fact and what to do about it. None is left out because there are others.
 """
 
 import math
@@ -29,12 +30,16 @@ from .ranking import (
 from .wording import in_a_row, mm_text, model_words, unbroken
 
 _NUMBERS: Final = ("no", "one", "two", "three", "four")
-_COVERED: Final = 0.75  # share of the measurements within 90 % intervals, below which these are too narrow
+_COVERED: Final = (
+    0.75  # share of the measurements within 90 % intervals, below which these are too narrow
+)
 _WORSE: Final = 0.1  # by which the share of a trial is much worse than that of all
 _CLOSE: Final = 1e-4  # distance from the first guess that counts as none, over a parameter's range
-_TURNED: Final = 3.0  # degrees by which identification rotates the markers, from which on their registration is wrong
+# Degrees by which identification rotates the markers, from which on their registration is wrong.
+_TURNED: Final = 3.0
 _NAMED: Final = 4  # trials at most that a line names
-_GROUPS: Final = {"sysid": "parameters", "sysid_elastic": "elastic"}  # keys of the ranges in the group `identify`
+# Keys of the ranges in the group `identify`.
+_GROUPS: Final = {"sysid": "parameters", "sysid_elastic": "elastic"}
 CAUSES: Final = "check names (exchanged ones too), nominal positions, and the unit"
 _KINDS: Final = ("inputs", "loads", "displacements")  # keys of `beyond` in the metrics
 
@@ -86,7 +91,9 @@ def conditions(metrics: Metrics, settings: RunSettings) -> list[str]:
 
 
 def _coverage(run: Judged) -> Iterator[str]:
-    """Yields prediction intervals that hold fewer measurements than they should, in all trials or in some."""
+    """Yields prediction intervals that hold fewer measurements than they should,
+    in all trials or in some.
+    """
     found = run.metrics.get("intervals", {}).get("models", {}).get(run.model, {})
     if "coverage" not in found:
         return
@@ -111,18 +118,24 @@ def _bounds(run: Judged) -> Iterator[str]:
     remedies = {
         "at a bound": (
             bounds,
-            "widen such a range in identify.parameters, or add the physics that the simulator lacks",
+            "widen such a range in identify.parameters, "
+            "or add the physics that the simulator lacks",
         ),
         "at the first guess": (guesses, "raise identify.starts"),
     }
     for where, (found, remedy) in remedies.items():
-        share = {text: f" in {len(of)} of {len(run.folds)} folds" * (len(run.folds) > 1) for text, of in found.items()}
+        share = {
+            text: f" in {len(of)} of {len(run.folds)} folds" * (len(run.folds) > 1)
+            for text, of in found.items()
+        }
         if found:
             yield f"{where}: {in_a_row([f'{text}{share[text]}' for text in found])}; {remedy}"
 
 
 def _at_bounds(metrics: Metrics) -> Iterator[str]:
-    """Yields the parameters of a split at a bound, of the simulators and of a law that is used, with their values."""
+    """Yields the parameters of a split at a bound, of the simulators and of a law
+    that is used, with their values.
+    """
     seen = set[str]()
     for of_model in metrics.get("at_bounds", {}).values():
         for name, value in of_model.items():
@@ -134,7 +147,11 @@ def _at_bounds(metrics: Metrics) -> Iterator[str]:
         return
     values, units = {**law["parameters"], **law.get("others", {})}, law.get("units", {})
     for name in (name for name in law.get("at_bounds", ()) if name in values and name not in seen):
-        known = f"{values[name]:.3g} {units[name]}".rstrip() if name in units else with_unit(name, values[name])
+        known = (
+            f"{values[name]:.3g} {units[name]}".rstrip()
+            if name in units
+            else with_unit(name, values[name])
+        )
         yield f"{in_sentence(name)} of the law {known}"
 
 
@@ -154,19 +171,24 @@ def _at_first_guess(metrics: Metrics, settings: RunSettings) -> Iterator[str]:
 
 
 def _beyond(run: Judged) -> Iterator[str]:
-    """Yields test trials whose loads, inputs or displacements lie beyond those of the training, and models there."""
+    """Yields test trials whose loads, inputs or displacements lie beyond those
+    of the training, and models there.
+    """
     tests, excess, left = list[str](), dict[str, Mapping[str, float]](), dict[str, float]()
     for fold in run.folds:
         tests += [row["name"] for row in fold.get("per_trajectory", ())]
         excess |= fold.get("beyond", {})
         if run.model in fold.get("range", {}):
             left |= fold["range"][run.model]["first_s"]
-    others, facts = [name for name in tests if name in excess or name in other_trials(run.settings)], list[str]()
+    others = [name for name in tests if name in excess or name in other_trials(run.settings)]
+    facts = list[str]()
     if others:
         largest = dict.fromkeys(_KINDS, 0.0)
         for of_trial in excess.values():
             largest |= {kind: max(share, largest[kind]) for kind, share in of_trial.items()}
-        shares = in_a_row([f"{_percent(share)} in {kind}" for kind, share in largest.items() if share > 0.0])
+        shares = in_a_row(
+            [f"{_percent(share)} in {kind}" for kind, share in largest.items() if share > 0.0]
+        )
         facts.append(_of_tests(others, tests) + (f", by up to {shares}" if shares else ""))
     if left:
         words = "these" if [*left] == others else _of_tests([*left], tests)
@@ -176,7 +198,7 @@ def _beyond(run: Judged) -> Iterator[str]:
 
 
 def _of_tests(some: list[str], tests: list[str]) -> str:
-    """Returns how many of the tests these are, with their names if they are few: "1 of 3 tests (a)"."""
+    """How many of the tests these are, with their names if they are few: "1 of 3 tests (a)"."""
     named = f" ({', '.join(some)})" if len(some) <= _NAMED else ""
     return f"{len(some)} of {len(tests)} tests{named}" if len(tests) > 1 else f"the test{named}"
 
@@ -186,13 +208,26 @@ def _mesh(run: Judged) -> Iterator[str]:
     checks = [fold["mesh_check"] for fold in run.folds if "mesh_check" in fold]
     moves = [moved for check in checks if (moved := check.get("moved_mm")) is not None]
     if checks and not moves:
-        yield f"mesh: its error is not known, as {_within(checks[0].get('failed', 'nothing was simulated'))}"
-    base = checks[0]["model"] if moves and run.model in ("law", "actuator", "resphys") else "simulation"
+        yield (
+            "mesh: its error is not known, as "
+            f"{_within(checks[0].get('failed', 'nothing was simulated'))}"
+        )
+    base = (
+        checks[0]["model"]
+        if moves and run.model in ("law", "actuator", "resphys")
+        else "simulation"
+    )
     if moves and run.model != base and run.model in run.known and base in run.known:
         moved, gained = fmean(moves), fmean(run.known[base]) - fmean(run.known[run.model])
         if moved > gained:
-            text = f"mesh: a finer one moves the markers by {mm_text(moved)}, and {model_words(run.model)} gains"
-            yield f"{text} {mm_text(max(gained, 0.0))} over {model_words(base)}; refine the mesh first"
+            text = (
+                f"mesh: a finer one moves the markers by {mm_text(moved)}, and "
+                f"{model_words(run.model)} gains"
+            )
+            yield (
+                f"{text} {mm_text(max(gained, 0.0))} over {model_words(base)}; "
+                "refine the mesh first"
+            )
 
 
 def _registration(run: Judged) -> Iterator[str]:
@@ -210,7 +245,9 @@ def _registration(run: Judged) -> Iterator[str]:
         yield f"{text}; check the positions of the markers, and the axes of recordings and mesh"
     error = fmean(run.known[run.model]) if run.model in run.known else math.inf
     if (rms := max((placement["rms_mm"] for placement in placed), default=0.0)) > error:
-        text = f"registration: the markers at rest fit their nominal positions to {mm_text(rms)} only"
+        text = (
+            f"registration: the markers at rest fit their nominal positions to {mm_text(rms)} only"
+        )
         yield f"{text}; {CAUSES}, and whether the body at rest is bent or sags"
 
 
@@ -229,12 +266,18 @@ def _refused(run: Judged) -> Iterator[str]:
     laws = [fold["law"] for fold in run.folds if "law" in fold]
     if laws and not any(law.get("accepted", True) for law in laws):
         against = model_words(laws[0]["against"])
-        yield f"not used: the law of the material, as it is not clearly closer to the trials than {against}"
+        yield (
+            "not used: the law of the material, "
+            f"as it is not clearly closer to the trials than {against}"
+        )
     for model in (model for model in CORRECTED if model in run.errors):
         if lost := sum(error is None for error in run.errors[model]):
             best = best_of(run.known, SIMULATORS)
             use = f"; use {model_words(best)}" if best else ""
-            yield f"not used: {model_words(model)} diverged in {lost} of {len(run.errors[model])} trials{use}"
+            yield (
+                f"not used: {model_words(model)} diverged in {lost} "
+                f"of {len(run.errors[model])} trials{use}"
+            )
 
 
 def _percent(share: float) -> str:

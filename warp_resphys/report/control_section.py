@@ -1,4 +1,6 @@
-"""The section on control: errors of followed paths on the simulated laboratory, how motions were planned."""
+"""The section on control: errors of followed paths on the simulated laboratory,
+how motions were planned.
+"""
 
 from collections.abc import Mapping, Sequence
 from statistics import fmean
@@ -13,10 +15,22 @@ from . import figures
 from .body_motions import plane_axes
 from .data import ControlResults, FollowedPath, RunReport, TrackingErrors
 from .page import Canvas, Cell, Items, PageTable, Part, Row, Text
-from .wording import MODELS, NONE, TONES, compared_controllers, controller_name, controller_words, mm_text, number_text
+from .wording import (
+    MODELS,
+    NONE,
+    TONES,
+    compared_controllers,
+    controller_name,
+    controller_words,
+    mm_text,
+    number_text,
+)
 
 # By beginning of a controller's name.
-_LINES: Final[Mapping[str, str | tuple[int, tuple[int, int]]]] = {"open": (0, (4, 2)), "receding": "-"}
+_LINES: Final[Mapping[str, str | tuple[int, tuple[int, int]]]] = {
+    "open": (0, (4, 2)),
+    "receding": "-",
+}
 _COLUMNS: Final = 5  # Of followed paths.
 
 
@@ -29,12 +43,14 @@ def control_section(data: RunReport, canvas: Canvas) -> Part | None:
     slowest = max(control.seconds)
     drawn = [followed for followed in data.followed if followed.seconds == slowest]
     if drawn:
-        named = {controller: controller_name(controller) for controller in compared_controllers(control)}
+        named = {
+            controller: controller_name(controller) for controller in compared_controllers(control)
+        }
         names = ", ".join(named.values())
         alt = f"{len(drawn)} paths of {slowest:g} s, and the paths of the point with {names}."
         caption = (
-            f"Paths of {slowest:g} s (grey), and the paths of the point in the simulated laboratory with {names}. The "
-            "point starts from where the tip hangs."
+            f"Paths of {slowest:g} s (grey), and the paths of the point in the simulated "
+            f"laboratory with {names}. The point starts from where the tip hangs."
         )
         plane = np.array([control.right, control.up], dtype=np.float64)
         blocks.append(canvas.figure("control", followed_paths(drawn, named, plane), alt, caption))
@@ -42,8 +58,11 @@ def control_section(data: RunReport, canvas: Canvas) -> Part | None:
     return Part("Control", blocks)
 
 
-def followed_paths(paths: Sequence[FollowedPath], controllers: Mapping[str, str], plane: FloatArray) -> Figure:
-    """Draws paths and the paths of the controlled point, side by side in their plane (2, 3): its width and height.
+def followed_paths(
+    paths: Sequence[FollowedPath], controllers: Mapping[str, str], plane: FloatArray
+) -> Figure:
+    """Draws paths and the paths of the controlled point,
+    side by side in their plane (2, 3): its width and height.
 
     Controllers are drawn in the order of their names, with their names in words.
     """
@@ -70,17 +89,24 @@ def followed_paths(paths: Sequence[FollowedPath], controllers: Mapping[str, str]
     for axes in every:
         axes.tick_params(labelsize=figures.STYLE["xtick.labelsize"] - 1.5)
     every[0].set_ylabel("mm")
-    figure.legend(list(lines.values()), list(lines), loc="outside upper left", ncols=4, columnspacing=1.6)
+    figure.legend(
+        list(lines.values()), list(lines), loc="outside upper left", ncols=4, columnspacing=1.6
+    )
     return figure
 
 
 def _task(control: ControlSettings) -> str:
     shapes, tracked = control.shapes, control.tracked
-    named = f"the mean of {', '.join(tracked[:-1])} and {tracked[-1]}" if len(tracked) > 1 else tracked[0]
+    named = (
+        f"the mean of {', '.join(tracked[:-1])} and {tracked[-1]}"
+        if len(tracked) > 1
+        else tracked[0]
+    )
     return (
-        f"A point, {named}, follows {len(shapes)} paths ({', '.join(shapes)}) of {1e3 * control.size:g} mm, by "
-        "inputs within their limits of value and rate, applied to the simulation that plays the robot. Errors are "
-        "distances of the point from the path at the same time, without camera noise."
+        f"A point, {named}, follows {len(shapes)} paths ({', '.join(shapes)}) of "
+        f"{1e3 * control.size:g} mm, by inputs within their limits of value and rate, applied to "
+        "the simulation that plays the robot. Errors are distances of the point from the path "
+        "at the same time, without camera noise."
     )
 
 
@@ -92,14 +118,18 @@ def tracking_table(tracking: Mapping[str, Mapping[str, TrackingErrors]]) -> Page
     def cell(errors: TrackingErrors | None) -> Cell:
         if errors is None:
             return Cell(NONE)
-        return Cell(number_text(errors["mean_mm"]), beside=f"at most {number_text(errors['max_mm'])}")
+        return Cell(
+            number_text(errors["mean_mm"]), beside=f"at most {number_text(errors['max_mm'])}"
+        )
 
     rows = []
     for controller in first:
         name, meaning = controller_words(controller)
         cells = [cell(errors.get(controller)) for errors in tracking.values()]
         rows.append(Row(name, cells, "best" * (controller == best), meaning))
-    return PageTable("Mean error of the point [mm]", [f"Paths in {float(speed):g} s" for speed in tracking], rows)
+    return PageTable(
+        "Mean error of the point [mm]", [f"Paths in {float(speed):g} s" for speed in tracking], rows
+    )
 
 
 def _facts(metrics: ControlResults) -> list[str]:
@@ -107,19 +137,23 @@ def _facts(metrics: ControlResults) -> list[str]:
     for model, reduced in metrics["reduced"].items():
         window, whole = mm_text(reduced["window_error_mm"]), mm_text(reduced["whole_error_mm"])
         facts.append(
-            f"{MODELS[model].name} in {reduced['modes']} modes: over {reduced['window_s']:g} s, {window} from the full "
-            f"model, {100.0 * reduced['window_relative']:.1f} % of its motion; over whole motions, {whole}."
+            f"{MODELS[model].name} in {reduced['modes']} modes: over {reduced['window_s']:g} s, "
+            f"{window} from the full model, {100.0 * reduced['window_relative']:.1f} % of its "
+            f"motion; over whole motions, {whole}."
         )
-    for model, motions in metrics["planned_mm"].items():  # By motion: errors before and after each correction.
-        first, last = fmean(errors[0] for errors in motions.values()), fmean(map(min, motions.values()))
+    # By motion: errors before and after each correction.
+    for model, motions in metrics["planned_mm"].items():
+        first = fmean(errors[0] for errors in motions.values())
+        last = fmean(map(min, motions.values()))
         facts.append(
-            f"{MODELS[model].name} follows its own plans to {mm_text(last)} after corrections by its full "
-            f"simulator, to {mm_text(first)} before."
+            f"{MODELS[model].name} follows its own plans to {mm_text(last)} after corrections by "
+            f"its full simulator, to {mm_text(first)} before."
         )
     for controller, times in metrics["command_ms"].items():
         if controller.startswith("receding_"):
             facts.append(
-                f"{controller_name(controller)}: a command takes {times['median']:.1f} ms, 95 % of them less than "
-                f"{times['largest_of_20']:.1f} ms, estimate and plan together, on one core."
+                f"{controller_name(controller)}: a command takes {times['median']:.1f} ms, 95 % "
+                f"of them less than {times['largest_of_20']:.1f} ms, "
+                "estimate and plan together, on one core."
             )
     return facts

@@ -28,7 +28,8 @@ from ..stepping.quantity import Quantity
 from .page import Usage
 from .wording import MODELS
 
-Errors = Mapping[str, Sequence[float | None]]  # Of each model on the same held-out trials [mm]; None: it diverged.
+# Of each model on the same held-out trials [mm]; None: it diverged.
+Errors = Mapping[str, Sequence[float | None]]
 
 
 class KeptWeights(TypedDict):
@@ -51,7 +52,7 @@ class Placed(TypedDict):
 
     rms_mm: float  # largest residual of the registration of a trial
     turned_deg: float  # identified rotation of the markers
-    left_out_mm: NotRequired[dict[str, float]]  # residuals of markers that the registration leaves out, by label
+    left_out_mm: NotRequired[dict[str, float]]  # residuals of left-out markers, by label
 
 
 class MeshCheck(TypedDict, total=False):
@@ -72,7 +73,7 @@ class ShapeErrors(TypedDict):
     vertices: int
     moved_mm: float
     errors_mm: dict[str, float | None]  # by model
-    outside: NotRequired[float]  # share of cells and states outside of the stretches of the law's training
+    outside: NotRequired[float]  # share of cells and states outside of the law's training stretches
 
 
 class TrackingErrors(TypedDict):
@@ -98,8 +99,8 @@ class ControlResults(TypedDict):
     """Content of control.json."""
 
     tracking: dict[str, dict[str, TrackingErrors]]  # by duration of the paths [s] and controller
-    command_ms: dict[str, dict[str, float]]  # `median` and `largest_of_20` of the computing times, by controller
-    planned_mm: dict[str, dict[str, list[float]]]  # before and after corrections, by model and motion
+    command_ms: dict[str, dict[str, float]]  # `median`, `largest_of_20` of times, by controller
+    planned_mm: dict[str, dict[str, list[float]]]  # before, after corrections, by model, motion
     reduced: dict[str, ReducedErrors]  # by model
     linear_validation_mm: float
 
@@ -112,9 +113,10 @@ class Metrics(ErrorTables, Usage, total=False):
     without_forces: bool  # whether no force is learned, as no forces are reconstructed
     parameters: dict[str, Mapping[str, float]]  # identified values, by model
     first_guesses: dict[str, Mapping[str, float]]
-    at_bounds: dict[str, dict[str, float]]  # identified values that lie on a bound of their range, by model
+    at_bounds: dict[str, dict[str, float]]  # identified values on a bound of their range, by model
     law: UsedLaw
-    # `mean_mm` and `max_mm`, distances between reconstructed and observed points of the training trials, by model
+    # `mean_mm` and `max_mm`, distances between reconstructed and observed points of the training
+    # trials, by model
     reconstruction: dict[str, dict[str, float]]
     control: ControlResults
     shapes: dict[str, ShapeErrors]
@@ -129,11 +131,12 @@ class TrialResults:
     """Observations of the R test trials, and the roll-outs of the models in them."""
 
     names: tuple[str, ...]
-    labels: tuple[str, ...]  # Of the M markers; empty where all vertices are observed, so that M = N.
-    begins: tuple[str, ...]  # Of each trial: given (the state is known), released, rest or static (a pose).
+    labels: tuple[str, ...]  # Of the M markers; empty where all vertices are observed: M = N.
+    begins: tuple[str, ...]  # Of each trial: given (the state is known), released, rest, static.
     times: FloatArray  # (R, T) of the evaluated frames [s].
     target: FloatArray  # (R, T, M, 3) [m] observed, NaN where a marker was not seen.
-    # (R, T, M, 3) [m] by model, of those without physics the best one; not finite after it diverged.
+    # (R, T, M, 3) [m] by model, of those without physics the best one; not finite after it
+    # diverged.
     positions: Mapping[str, FloatArray]
     bound: FloatArray  # (M, 3) [m] the markers on the undeformed body, or its vertices.
     gravity: FloatArray  # (3,) [m/s^2]
@@ -157,7 +160,10 @@ class TrialResults:
     @cached_property
     def worst(self) -> int:
         """Index of the trial with the largest mean of `plain_errors_mm`."""
-        means = [row[np.isfinite(row)].mean() if np.isfinite(row).any() else np.inf for row in self.plain_errors_mm]
+        means = [
+            row[np.isfinite(row)].mean() if np.isfinite(row).any() else np.inf
+            for row in self.plain_errors_mm
+        ]
         return int(np.argmax(means))
 
     @property
@@ -168,7 +174,8 @@ class TrialResults:
     def of_tip(self, tip: IntArray) -> "TrialResults":
         """Returns the same trials with the mean of some vertices (P,) as the only marker."""
         target, bound, *simulated = (
-            q[..., tip, :].mean(-2, keepdims=True) for q in (self.target, self.bound, *self.positions.values())
+            q[..., tip, :].mean(-2, keepdims=True)
+            for q in (self.target, self.bound, *self.positions.values())
         )
         positions = dict(zip(self.positions, simulated, strict=True))
         return replace(self, labels=("tip",), target=target, bound=bound, positions=positions)
@@ -208,7 +215,10 @@ class Driven:
 
     @cached_property
     def used(self) -> tuple[int, ...]:
-        """Numbers of the parts that some trial drives by more than the noise of a gauge; all where none does."""
+        """Numbers of the parts that some trial drives by more than the noise of a gauge.
+
+        All where none does.
+        """
         largest = np.max([np.abs(values).max(axis=0) for values in self.values.values()], axis=0)
         driven = np.flatnonzero(largest > NO_INPUT * largest.max())
         return tuple(driven.tolist()) or tuple(range(len(self.channels)))
@@ -248,11 +258,12 @@ class RunReport:
     settings: RunSettings
     mesh: Mesh  # The undeformed body.
     fixed: IntArray  # Clamped vertices.
-    tip: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # Vertices, where all are observed.
+    tip: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # If all are seen.
     chambers: tuple[Chamber, ...] = ()  # Chambers under pressure.
     tendons: Mapping[str, FloatArray] = field(default_factory=dict)  # (G, 3) guides [m], by name.
     obstacles: ObstacleSurface = field(default_factory=ObstacleSurface)  # That the body touches.
-    # (K + 1, O) inputs of contact by name, in the test trials by name: poses of the obstacles at the steps.
+    # (K + 1, O) inputs of contact by name, in the test trials by name: poses of the obstacles at
+    # the steps.
     moved: Mapping[str, Mapping[str, FloatArray]] = field(default_factory=dict)
     trials: TrialResults | None = None  # Test trials; None over the folds.
     film: Film | None = None  # Motion of the bodies in one of them.
@@ -260,16 +271,19 @@ class RunReport:
     recordings: Recordings | None = None  # Quality and registration of all trials.
     forces: Mapping[str, ForceCurve] = field(default_factory=dict)  # By sensor.
     identification: Mapping[str, Identification] = field(default_factory=dict)  # By model.
-    actuator: Mapping[str, InputNetwork] = field(default_factory=dict)  # Learned changes of inputs, by input.
-    stretches: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # Least and largest, by kind of trial.
-    outside: float | None = None  # Share of cells and states of the test trials outside of the law's training.
-    start: Mapping[str, float] = field(default_factory=dict)  # Values of the data sheet, by parameter.
-    truth: Mapping[str, float] = field(default_factory=dict)  # Values of the simulated laboratory, by parameter.
+    actuator: Mapping[str, InputNetwork] = field(default_factory=dict)  # Learned ones, by input.
+    stretches: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # By kind of trial.
+    outside: float | None = (
+        None  # Share of cells and states of the test trials outside of the law's training.
+    )
+    start: Mapping[str, float] = field(default_factory=dict)  # Of the data sheet, by parameter.
+    truth: Mapping[str, float] = field(default_factory=dict)  # Of the laboratory, by parameter.
     true_material: str = "corotated"  # Model of its material.
-    # Records of `learning.residuals.training.EpochTrainer.history`, by learned model; None: not finite.
+    # Records of `learning.residuals.training.EpochTrainer.history`, by learned model; None: not
+    # finite.
     training: Mapping[str, Sequence[Mapping[str, float | None]]] = field(default_factory=dict)
     followed: Sequence[FollowedPath] = ()  # Driven paths of the group `control`.
-    pages: Mapping[str, str] = field(default_factory=dict)  # Address of each fold's page, by its test trial.
+    pages: Mapping[str, str] = field(default_factory=dict)  # Of each fold, by its test trial.
 
     @property
     def published(self) -> Mapping[str, PublishedError]:
@@ -283,7 +297,10 @@ class RunReport:
             return self.obstacles
         steps = self.trials.time_step * np.arange(len(next(iter(inputs.values()))))
         return self.obstacles.moved(
-            {name: np.stack([np.interp(times, steps, x) for x in values.T], axis=1) for name, values in inputs.items()}
+            {
+                name: np.stack([np.interp(times, steps, x) for x in values.T], axis=1)
+                for name, values in inputs.items()
+            }
         )
 
     @property
@@ -298,7 +315,10 @@ class RunReport:
 
 
 def other_trials(settings: RunSettings) -> tuple[str, ...]:
-    """Returns the names of the test trials outside of the training loads; empty for most experiments."""
+    """Returns the names of the test trials outside of the training loads.
+
+    Empty for most experiments.
+    """
     return tuple(settings.data.others) if isinstance(settings.data, ReleaseFromLoad) else ()
 
 
@@ -308,20 +328,32 @@ def folds_in(metrics: Metrics) -> list[Metrics]:
 
 
 def force_errors(metrics: Metrics) -> dict[str, tuple[str, float, dict[str, float | None]]]:
-    """Unit, mean size of the force and mean errors by model of each force sensor; None for a model that diverged."""
+    """Unit, mean size of the force and mean errors by model of each force sensor.
+
+    None for a model that diverged.
+    """
     found = dict[str, tuple[str, float, dict[str, float | None]]]()
     folds = [fold["forces"] for fold in folds_in(metrics) if "forces" in fold]
     for name in dict.fromkeys(name for fold in folds for name in fold):
         tables = [fold[name] for fold in folds if name in fold]
-        shared = [model for model in tables[0]["models"] if all(model in table["models"] for table in tables)]
+        shared = [
+            model
+            for model in tables[0]["models"]
+            if all(model in table["models"] for table in tables)
+        ]
         means = {model: [table["models"][model]["mean"] for table in tables] for model in shared}
-        errors = {m: None if None in of else fmean(x for x in of if x is not None) for m, of in means.items()}
+        errors = {
+            m: None if None in of else fmean(x for x in of if x is not None)
+            for m, of in means.items()
+        }
         found[name] = tables[0]["unit"], fmean(table["size"] for table in tables), errors
     return found
 
 
 def trial_errors(metrics: Metrics, others: Collection[str] = (), outside: bool = False) -> Errors:
-    """Returns the errors on each held-out trial [mm], by model that all folds have; None where a roll-out diverged.
+    """Returns the errors on each held-out trial [mm], by model that all folds have.
+
+    None where a roll-out diverged.
 
     Args:
         metrics: of a split or of folds.
@@ -330,14 +362,23 @@ def trial_errors(metrics: Metrics, others: Collection[str] = (), outside: bool =
     """
     every = [row for fold in folds_in(metrics) for row in fold.get("per_trajectory", ())]
     rows = [row for row in every if (row["name"] in others) is outside]
-    models = [model for model in (rows[0]["errors_mm"] if rows else ()) if all(model in r["errors_mm"] for r in every)]
+    models = [
+        model
+        for model in (rows[0]["errors_mm"] if rows else ())
+        if all(model in r["errors_mm"] for r in every)
+    ]
     return {model: [row["errors_mm"][model] for row in rows] for model in models}
 
 
 def grouped_errors(metrics: Metrics, settings: RunSettings) -> dict[str, Errors]:
-    """Returns the errors on the held-out trials by the title of their group: as in training, then with other loads."""
+    """Returns the errors on the held-out trials by the title of their group:
+    as in training, then with other loads.
+    """
     others = other_trials(settings)
-    groups = {title: trial_errors(metrics, others, at > 0) for at, title in enumerate(settings.test_titles)}
+    groups = {
+        title: trial_errors(metrics, others, at > 0)
+        for at, title in enumerate(settings.test_titles)
+    }
     if all(groups.values()):
         return groups
     errors = next(filter(None, groups.values()), {})
@@ -347,14 +388,24 @@ def grouped_errors(metrics: Metrics, settings: RunSettings) -> dict[str, Errors]
 
 def missing_baselines(metrics: Metrics) -> dict[str, str]:
     """Returns why predictions without physics are missing, by model."""
-    return {model: why for fold in folds_in(metrics) for model, why in fold.get("missing_baselines", {}).items()}
+    return {
+        model: why
+        for fold in folds_in(metrics)
+        for model, why in fold.get("missing_baselines", {}).items()
+    }
 
 
 def best_and_worst(trials: TrialResults) -> list[int]:
-    """Returns the motions with the largest and the least error of the last model of the table; one if there is one."""
+    """Returns the motions with the largest and the least error of the last model of the table.
+
+    One if there is one.
+    """
     moving = [row for row, begins in enumerate(trials.begins) if begins != "static"]
-    errors = trials.errors_mm[next(m for m in reversed(list(MODELS)) if m in trials.positions)][moving]
-    means = np.array([row[~np.isnan(row)].mean() if (~np.isnan(row)).any() else np.inf for row in errors])
+    errors = trials.errors_mm[next(m for m in reversed(list(MODELS)) if m in trials.positions)]
+    errors = errors[moving]
+    means = np.array(
+        [row[~np.isnan(row)].mean() if (~np.isnan(row)).any() else np.inf for row in errors]
+    )
     worst, best = moving[int(np.argmax(means))], moving[int(np.argmin(means))]
     return [worst] if worst == best else [worst, best]
 
@@ -372,17 +423,26 @@ def at_times(positions: FloatArray, frames: FloatArray, times: FloatArray) -> Fl
     share = np.maximum(at - low, 0.0)[:, None, None]
     after = positions[np.minimum(low + 1, len(positions) - 1)]
     with np.errstate(invalid="ignore", over="ignore"):
-        between: FloatArray = np.where(share > 1e-9, (1.0 - share) * positions[low] + share * after, positions[low])
+        between: FloatArray = np.where(
+            share > 1e-9, (1.0 - share) * positions[low] + share * after, positions[low]
+        )
     return between
 
 
 def spread(values: IntArray, most: int) -> IntArray:
-    """Returns the values (N,), or some of them that are spread evenly, the first and the last one among them."""
+    """Returns the values (N,), or some of them that are spread evenly,
+    the first and the last one among them.
+    """
     return (
-        values[np.unique(np.linspace(0, len(values) - 1, most).round().astype(int))] if len(values) > most else values
+        values[np.unique(np.linspace(0, len(values) - 1, most).round().astype(int))]
+        if len(values) > most
+        else values
     )
 
 
 def shown_markers(target: FloatArray) -> IntArray:
-    """Returns the indices of the markers (T, M, 3) of a trial that were seen in a frame; NaN where one was not."""
+    """Returns the indices of the markers (T, M, 3) of a trial that were seen in a frame.
+
+    NaN where one was not.
+    """
     return np.flatnonzero(np.isfinite(target).all(axis=2).any(axis=0))

@@ -1,4 +1,6 @@
-"""The sections on errors over time, of each marker and of each rigid body, and on the training of the networks."""
+"""The sections on errors over time, of each marker and of each rigid body,
+and on the training of the networks.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -18,7 +20,8 @@ from .wording import MODELS, TONES, largest_text, mm_text, number_text, unbroken
 _FILTER: Final = 1.0  # Window of the median filter [s], as published.
 _LENGTHS: Final = 4.0  # Least length of a roll-out that is filtered, in windows.
 _TRAINED: Final = (
-    "Losses, and the roll-out error on the trials by which the weights are chosen; the dot marks the lowest."
+    "Losses, and the roll-out error on the trials by which the weights are chosen; "
+    "the dot marks the lowest."
 )
 _BETWEEN: Final = 0.07  # Space between panels, so that labels of their ends do not meet.
 
@@ -33,7 +36,10 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         times = np.nanmean(trials.times, axis=0)
         window = _FILTER if times[-1] >= _LENGTHS * _FILTER - 1e-9 else None
         of = "marker" if data.sees_markers else "vertex"
-        reached = "; ".join(f"{MODELS[model].name} reaches {largest_text(e)}" for model, e in trials.errors_mm.items())
+        reached = "; ".join(
+            f"{MODELS[model].name} reaches {largest_text(e)}"
+            for model, e in trials.errors_mm.items()
+        )
         alt = f"Mean {of} error of the models over time, on a logarithmic axis. {reached}."
         panels: dict[str, BoolArray | slice] = {"": slice(None)}
         if len(grouped_errors(metrics, data.settings)) > 1:
@@ -43,31 +49,55 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         figure = error_over_time(trials.errors_mm, times, of, window, panels)
         blocks.append(canvas.figure("error_over_time", figure, alt, _error_caption(data, window)))
     if by_model := metrics.get("per_marker"):
-        shown = [label for label in trials.labels if any(label in markers for markers in by_model.values())]
-        by_label = {label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown}
+        shown = [
+            label
+            for label in trials.labels
+            if any(label in markers for markers in by_model.values())
+        ]
+        by_label = {
+            label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown
+        }
         blocks.append(model_table("Each marker [mm]", numbers(by_label), metrics["errors_mm"]))
     if forces := force_errors(metrics):
         for name, curve in data.forces.items():
-            alt = f"{curve.axis} of {name} over time in the test trial {curve.trial}, measured and of the models."
+            alt = (
+                f"{curve.axis} of {name} over time in the test trial {curve.trial}, "
+                "measured and of the models."
+            )
             blocks.append(
-                canvas.figure(f"force_{name}", force_over_time(name, curve), alt, f"Test trial {curve.trial}.")
+                canvas.figure(
+                    f"force_{name}", force_over_time(name, curve), alt, f"Test trial {curve.trial}."
+                )
             )
         by_sensor = {
-            f"{name} [{unit}], of {size:.3g} {unit}": {**known} for name, (unit, size, known) in forces.items()
+            f"{name} [{unit}], of {size:.3g} {unit}": {**known}
+            for name, (unit, size, known) in forces.items()
         }
-        note = "Mean error of the force, beside its mean size; without zero and drift, where the sensor has them."
+        note = (
+            "Mean error of the force, beside its mean size; "
+            "without zero and drift, where the sensor has them."
+        )
         blocks.append(model_table("Force", numbers(by_sensor), metrics["errors_mm"], note))
     if by_phase := metrics.get("phases"):
         rows = {
             phase.capitalize(): {m: summary["mean"] for m, summary in models.items()}
             for phase, models in by_phase.items()
         }
-        note = "Rise: the first half second after the inputs grew. Hold: after that. Release: after they fell."
-        blocks.append(model_table("Phase; mean error [mm]", numbers(rows), metrics["errors_mm"], note))
+        note = (
+            "Rise: the first half second after the inputs grew. "
+            "Hold: after that. Release: after they fell."
+        )
+        blocks.append(
+            model_table("Phase; mean error [mm]", numbers(rows), metrics["errors_mm"], note)
+        )
     if turned := metrics.get("orientations_deg"):
         bodies = next(iter(turned.values()))
         by_body = {name: {m: angles[name] for m, angles in turned.items()} for name in bodies}
-        blocks.append(model_table("Orientation of each rigid body [degrees]", numbers(by_body), metrics["errors_mm"]))
+        blocks.append(
+            model_table(
+                "Orientation of each rigid body [degrees]", numbers(by_body), metrics["errors_mm"]
+            )
+        )
     if check := metrics.get("mesh_check"):
         blocks += [Text("Error of the mesh", heading=True), Text(mesh_text(check))]
     return Part("Error over time" if trials.moves else "Each marker", blocks) if blocks else None
@@ -79,12 +109,17 @@ def mesh_text(check: MeshCheck) -> str:
         return f"The error of the mesh is not known: {check['failed']}"
     cells, finer = check["cells"]
     vertices = "{:,} instead of {:,} vertices".format(*check["vertices"][::-1])
-    mesh = f"quadratic cells ({vertices})" if cells == finer else f"{finer:,} instead of {cells:,} cells"
+    mesh = (
+        f"quadratic cells ({vertices})"
+        if cells == finer
+        else f"{finer:,} instead of {cells:,} cells"
+    )
     model, (before, after) = MODELS[check["model"]].name, map(mm_text, check["errors_mm"])
     return unbroken(
-        f"With {mesh} and the same parameters, {model} moves the markers by {mm_text(check['moved_mm'])}, and its "
-        f"error is {after} instead of {before}, at the beginning of {listed(check['trials'])}. Parameters that are "
-        "identified on a finer mesh differ."
+        f"With {mesh} and the same parameters, {model} moves the markers by "
+        f"{mm_text(check['moved_mm'])}, and its error is {after} instead of {before}, at the "
+        f"beginning of {listed(check['trials'])}. "
+        "Parameters that are identified on a finer mesh differ."
     )
 
 
@@ -98,11 +133,12 @@ def error_over_time(
     """Draws each model's mean error over time and, for the main models, the range of the trials.
 
     Args:
-        errors: (R, T) errors [mm] of R trials by model; NaN where nothing was seen, infinite where it diverged.
+        errors: (R, T) errors [mm] of R trials by model; NaN where nothing was seen, infinite where
+            it diverged.
         times: (T,) [s].
         of: What is observed: "vertex" or "marker".
-        window: Of a median filter [s], for long trials: the filtered error is drawn instead of the range, and the
-            unfiltered one as a thin line. None for no filter.
+        window: Of a median filter [s], for long trials: the filtered error is drawn instead of the
+            range, and the unfiltered one as a thin line. None for no filter.
         panels: Rows of the trials of each panel, by title; by default one panel has all trials.
     """
     groups = panels or {"": slice(None)}
@@ -112,7 +148,11 @@ def error_over_time(
         for model, values in errors.items():
             seen, line = ~np.isnan(values[rows]), figures.model_line(model)
             count = seen.sum(axis=0)
-            mean = np.where(count > 0, np.where(seen, values[rows], 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
+            mean = np.where(
+                count > 0,
+                np.where(seen, values[rows], 0.0).sum(axis=0) / np.maximum(count, 1),
+                np.nan,
+            )
             shown = figures.positive(mean)
             if window is not None:
                 axes.plot(times, shown, color=line["color"], linewidth=0.6, alpha=0.45)
@@ -120,7 +160,10 @@ def error_over_time(
                 settled = shown[len(shown) // 10 :]
                 lowest += [float(np.nanmin(settled))] if np.isfinite(settled).any() else []
             elif len(values[rows]) > 1 and (model == "sysid" or line["linestyle"] == "-"):
-                low, high = (figures.positive(extreme.reduce(values[rows], axis=0)) for extreme in (np.fmin, np.fmax))
+                low, high = (
+                    figures.positive(extreme.reduce(values[rows], axis=0))
+                    for extreme in (np.fmin, np.fmax)
+                )
                 axes.fill_between(times, low, high, color=line["color"], alpha=0.15, linewidth=0)
             axes.plot(times, shown, **line)
         axes.set(title=title, xlabel="time [s]", xlim=(0.0, times[-1]))
@@ -128,7 +171,8 @@ def error_over_time(
         figure.set_layout_engine("constrained", wspace=_BETWEEN)
         figures.few_ticks(every[0, 0].xaxis, 5)
     for axes in every.flat:  # Once everything is drawn, as they share their axis.
-        figures.use_logarithm(axes, 0.4 * min(lowest, default=0.0))  # Cuts off the small errors at the start.
+        # Cuts off the small errors at the start.
+        figures.use_logarithm(axes, 0.4 * min(lowest, default=0.0))
     every[0, 0].set_ylabel(f"mean {of} error [mm]")
     figures.legend_above(figure, every[0, 0])
     return figure
@@ -141,19 +185,31 @@ def force_over_time(name: str, curve: ForceCurve) -> Figure:
     for model, values in curve.models.items():
         axes.plot(curve.times, values, **figures.model_line(model))
     axes.plot(curve.times, curve.measured, color="black", linewidth=0.9, label="measured", zorder=3)
-    axes.set(xlabel="time [s]", ylabel=f"{name}.{curve.axis} [{curve.unit}]", xlim=(curve.times[0], curve.times[-1]))
+    axes.set(
+        xlabel="time [s]",
+        ylabel=f"{name}.{curve.axis} [{curve.unit}]",
+        xlim=(curve.times[0], curve.times[-1]),
+    )
     figures.legend_above(figure, axes)
     return figure
 
 
 def _error_caption(data: RunReport, window: float | None) -> str:
     count = len(data.metrics["per_trajectory"])
-    text = f"Mean over the {'visible markers' if data.sees_markers else 'vertices, against the target'}"
+    text = (
+        "Mean over the "
+        f"{'visible markers' if data.sees_markers else 'vertices, against the target'}"
+    )
     if window is not None:
-        text += f" and {number_of(count, 'test trial')}, after a median filter of 1 s; the thin lines are not filtered."
+        text += (
+            f" and {number_of(count, 'test trial')}, after a median filter of 1 s; the thin "
+            "lines are not filtered."
+        )
     elif count > 1:
         parted = len(grouped_errors(data.metrics, data.settings)) > 1
-        text += f": the line is the mean of the {'' if parted else f'{count} '}test trials, the band"
+        text += (
+            f": the line is the mean of the {'' if parted else f'{count} '}test trials, the band"
+        )
         text += " of a solid line" if data.sees_markers else ""
         text += " spans the smallest to the largest of them."
     else:
@@ -168,33 +224,47 @@ def training_section(data: RunReport, canvas: Canvas) -> Part | None:
     blocks: list[Any] = []
     for model, (name, *_) in MODELS.items():
         if records := data.training.get(model):
-            alt = f"Losses and validation roll-out error of the training of {name}, {len(records)} epochs."
+            alt = (
+                f"Losses and validation roll-out error of the training of {name}, "
+                f"{len(records)} epochs."
+            )
             figure = canvas.figure(f"training_{model}", training_curves(records), alt, _TRAINED)
             blocks += [Text(name, heading=True), figure]
     return Part("Training", blocks) if blocks else None
 
 
 def training_curves(records: Sequence[Mapping[str, float | None]]) -> Figure:
-    """Draws the losses and, where they were recorded, the validation roll-out error and the learning rate.
+    """Draws the losses and, where they were recorded,
+    the validation roll-out error and the learning rate.
 
     Args:
-        records: One for each epoch, with `epoch`, `train_loss`, `validation_loss`, and in some or all epochs
-            `rollout_error_mm` and `learning_rate`; values that were not measured are None or absent.
+        records: One for each epoch, with `epoch`, `train_loss`, `validation_loss`, and in some or
+            all epochs `rollout_error_mm` and `learning_rate`; values that were not measured are
+            None or absent.
     """
 
     def measured(key: str) -> tuple[FloatArray, FloatArray]:  # Epochs and values.
-        known = [(record["epoch"], record[key]) for record in records if record.get(key) is not None]
+        known = [
+            (record["epoch"], record[key]) for record in records if record.get(key) is not None
+        ]
         epochs, values = np.asarray(known, dtype=np.float64).reshape(-1, 2).T
         return epochs, figures.positive(values)
 
     heights = {"losses": 3, "rollout_error_mm": 3, "learning_rate": 1}
-    heights = {key: height for key, height in heights.items() if key == "losses" or len(measured(key)[0])}
+    heights = {
+        key: height for key, height in heights.items() if key == "losses" or len(measured(key)[0])
+    }
     muted, strong = TONES["muted"].light, TONES["resphys"].light
     thin: dict[str, Any] = {"linewidth": 1.1, "marker": "." if len(records) == 1 else ""}
     figure = figures.new_figure(0.6 + 0.57 * sum(heights.values()))
-    rows = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=[*heights.values()])[:, 0]
+    rows = figure.subplots(
+        len(heights), 1, sharex=True, squeeze=False, height_ratios=[*heights.values()]
+    )[:, 0]
     axes = dict(zip(heights, rows, strict=True))
-    for key, label, colour in (("train_loss", "Training loss", muted), ("validation_loss", "Validation loss", strong)):
+    for key, label, colour in (
+        ("train_loss", "Training loss", muted),
+        ("validation_loss", "Validation loss", strong),
+    ):
         epochs, losses = measured(key)
         if len(epochs):
             axes["losses"].plot(epochs, losses, color=colour, label=label, **thin)
@@ -206,10 +276,16 @@ def training_curves(records: Sequence[Mapping[str, float | None]]) -> Figure:
         curve.set_ylabel("roll-out\nerror [mm]")
         if np.isfinite(errors).any():
             best = int(np.nanargmin(errors))
-            curve.plot(epochs[best], errors[best], "o", color=TONES["simulation"].light, markersize=5)
-            curve.set_title(f"lowest: {number_text(errors[best])} mm, epoch {epochs[best]:.0f}", loc="right")
+            curve.plot(
+                epochs[best], errors[best], "o", color=TONES["simulation"].light, markersize=5
+            )
+            curve.set_title(
+                f"lowest: {number_text(errors[best])} mm, epoch {epochs[best]:.0f}", loc="right"
+            )
     if "learning_rate" in axes:
-        axes["learning_rate"].plot(*measured("learning_rate"), color=muted, drawstyle="steps-mid", **thin)
+        axes["learning_rate"].plot(
+            *measured("learning_rate"), color=muted, drawstyle="steps-mid", **thin
+        )
         axes["learning_rate"].set_ylabel("learning\nrate")
     for row in rows:
         figures.use_logarithm(row)

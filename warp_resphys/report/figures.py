@@ -23,9 +23,21 @@ from ..learning.baselines import BASELINES
 from .wording import MODELS, TONES
 
 # Okabe and Ito (2008): distinguishable with colour vision deficiencies.
-CHAMBER_COLOURS: Final = ("#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#f0e442", "#7f7f7f")
+CHAMBER_COLOURS: Final = (
+    "#e69f00",
+    "#56b4e9",
+    "#009e73",
+    "#d55e00",
+    "#0072b2",
+    "#cc79a7",
+    "#f0e442",
+    "#7f7f7f",
+)
 LARGEST_SHOWN: Final = 1e5  # Largest error [mm] or loss that is drawn.
-FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
+FONT: Final = (
+    "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', "
+    "Arial, 'DejaVu Sans', sans-serif"
+)
 WIDE: Final = 7.3  # [in]
 _LEGEND_ROW: Final = 5  # Largest number of names in one row.
 _BETWEEN: Final = 0.07  # Space between panels, so that labels of their ends do not meet.
@@ -89,13 +101,21 @@ def themed_svg(figure: Figure, name: str) -> bytes:
     """
     buffer = io.StringIO()
     with mpl.rc_context({**STYLE, "svg.hashsalt": name}):
-        figure.savefig(buffer, format="svg", dpi=240, transparent=True, metadata={"Date": None, "Creator": None})
+        figure.savefig(
+            buffer,
+            format="svg",
+            dpi=240,
+            transparent=True,
+            metadata={"Date": None, "Creator": None},
+        )
     foreign = r"<\?xml.*?\?>|<!DOCTYPE.*?>|<metadata>.*?</metadata>"
     svg = re.sub(foreign, "", buffer.getvalue(), flags=re.DOTALL)
     svg = re.sub(r"'DejaVu Sans'(, [^;\"]*)?", FONT, svg)
     for role, tone in TONES.items():
         svg = svg.replace(tone.light, f"var(--{role})")
-    light, dark = ("".join(f"--{role}:{tone[at]};" for role, tone in TONES.items()) for at in range(2))
+    light, dark = (
+        "".join(f"--{role}:{tone[at]};" for role, tone in TONES.items()) for at in range(2)
+    )
     style = f"<style>:root{{{light}}}@media (prefers-color-scheme:dark){{:root{{{dark}}}}}</style>"
     return re.sub(r"(<svg [^>]*>)", rf"\1{style}", svg, count=1).strip().encode()
 
@@ -109,9 +129,16 @@ def settle(figure: Figure) -> None:
 
 
 def model_line(model: str, width: float = 1.4) -> dict[str, Any]:
-    """Returns style and label of a model's line; that of ResPhys is thicker, and dashed ones are drawn over it."""
+    """Returns style and label of a model's line.
+
+    That of ResPhys is thicker, and dashed ones are drawn over it.
+    """
     width += 0.5 if model == "resphys" else 0.0
-    look = {"color": TONES[model].light, "linestyle": _DASHED.get(model, "-"), "zorder": 2.1 if model in _DASHED else 2}
+    look = {
+        "color": TONES[model].light,
+        "linestyle": _DASHED.get(model, "-"),
+        "zorder": 2.1 if model in _DASHED else 2,
+    }
     return {**look, "linewidth": width, "label": MODELS[model].name}
 
 
@@ -152,19 +179,30 @@ def count(axis: Axis, most: int) -> None:
 
 
 def positive(values: FloatArray) -> FloatArray:
-    """Returns values for a logarithmic axis: NaN where they are not positive or exceed `LARGEST_SHOWN`."""
+    """Returns values for a logarithmic axis: NaN where they are not positive
+    or exceed `LARGEST_SHOWN`.
+    """
     return np.where((values > 0.0) & (values < LARGEST_SHOWN), values, np.nan)
 
 
 def use_logarithm(axes: Axes, least: float = 0.0) -> None:
-    """Makes the y axis logarithmic, over at least a factor of five and from a least value; call it after drawing.
+    """Makes the y axis logarithmic, over at least a factor of five and from a least value.
 
-    Labels are 0.1, 1, 10 or, on long axes, powers of ten; on short axes 2 and 5 are labelled too. Where no value can be
-    shown, such as errors that are all zero, a sentence is written instead.
+    Call it after drawing.
+
+    Labels are 0.1, 1, 10 or, on long axes, powers of ten; on short axes 2 and 5 are labelled too.
+    Where no value can be shown, such as errors that are all zero, a sentence is written instead.
     """
     if not np.isfinite(axes.dataLim.minposy):
         axes.set(yticks=[], ylim=(0.0, 1.0))
-        axes.text(0.5, 0.5, "zero, or diverged, throughout", ha="center", va="center", transform=axes.transAxes)
+        axes.text(
+            0.5,
+            0.5,
+            "zero, or diverged, throughout",
+            ha="center",
+            va="center",
+            transform=axes.transAxes,
+        )
         return
     axes.set_yscale("log")
     low, high = axes.get_ylim()
@@ -175,8 +213,12 @@ def use_logarithm(axes: Axes, least: float = 0.0) -> None:
     axes.set_ylim(low, high)
     plain = low >= 5e-5 and high <= 2e4
     decades = math.floor(math.log10(high) + 1e-9) - math.ceil(math.log10(low) - 1e-9) + 1
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < 3 else (1.0,), numticks=6))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if plain else _power(value)))
+    axes.yaxis.set_major_locator(
+        LogLocator(subs=(1.0, 2.0, 5.0) if decades < 3 else (1.0,), numticks=6)
+    )
+    axes.yaxis.set_major_formatter(
+        FuncFormatter(lambda value, _: f"{value:g}" if plain else _power(value))
+    )
     axes.yaxis.set_minor_locator(NullLocator())
 
 

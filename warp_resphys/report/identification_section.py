@@ -42,9 +42,13 @@ _UNITS: Final = (  # By patterns of names, of which the first one that fits coun
     (rf"(.+_)?contraction{_BAND}", "mm", 1e3),
 )
 _PROPER: Final = ("Young", "Poisson", "Prony", "Mooney", "Ogden")
-_WHOLE: Final = 99.5  # Deviation from which on a parameter is not determined at all [% of its range].
+_WHOLE: Final = (
+    99.5  # Deviation from which on a parameter is not determined at all [% of its range].
+)
 _TIED: Final = 0.9  # Correlation from which on two parameters count as not separable.
-_UNINFORMED: Final = 0.8  # Deviation over that of the prior, from which on the data add almost nothing.
+_UNINFORMED: Final = (
+    0.8  # Deviation over that of the prior, from which on the data add almost nothing.
+)
 
 
 def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
@@ -57,33 +61,58 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
         PageTable(MODELS[name].name, columns, parameter_rows(result, data.start, data.truth))
         for name, result in identified.items()
     ]
-    blocks += [table for result in identified.values() if (table := trials_table(result)) is not None]
-    texts = (uncertainty_text(name, result, data.settings.identify) for name, result in identified.items())
+    blocks += [
+        table for result in identified.values() if (table := trials_table(result)) is not None
+    ]
+    texts = (
+        uncertainty_text(name, result, data.settings.identify)
+        for name, result in identified.items()
+    )
     uncertain = list(filter(None, texts))
     notes = []
     if uncertain:
-        notes.append("± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time.")
+        notes.append(
+            "± is one standard deviation in the Gauss-Newton approximation, for residuals "
+            "correlated in time."
+        )
     if data.truth:
         model = data.true_material.replace("_", " ")
-        notes.append(f"The true values are those of the simulated laboratory, whose material is {model}.")
+        notes.append(
+            f"The true values are those of the simulated laboratory, whose material is {model}."
+        )
     blocks += [Text(" ".join(notes), note=True)] if notes else []
     blocks += [Text(text) for text in uncertain]
-    placed = {name: result.placement for name, result in identified.items() if result.placement is not None}
+    placed = {
+        name: result.placement
+        for name, result in identified.items()
+        if result.placement is not None
+    }
     markers = data.settings.markers
-    lengths = {} if markers is None else {name: body.length for name, body in markers.rigid_bodies.items()}
+    lengths = (
+        {}
+        if markers is None
+        else {name: body.length for name, body in markers.rigid_bodies.items()}
+    )
     blocks += [Text(placement_text(name, placement, lengths)) for name, placement in placed.items()]
-    if histories := {name: result.history for name, result in identified.items() if any(result.history)}:
-        alt = "Loss of the identification over its evaluations, with a line for each start, on a logarithmic axis."
+    if histories := {
+        name: result.history for name, result in identified.items() if any(result.history)
+    }:
+        alt = (
+            "Loss of the identification over its evaluations, with a line for each start, on a "
+            "logarithmic axis."
+        )
         caption = (
-            "Lowest loss so far over the evaluations, with a line for each start; the kept start is bold. The loss "
-            "is the mean squared distance of the markers over the square of the motion’s amplitude."  # noqa: RUF001
+            "Lowest loss so far over the evaluations, with a line for each start; the kept start "
+            "is bold. The loss is the mean squared distance of the markers over the square of the "
+            "motion’s amplitude."  # noqa: RUF001
         )
         blocks.append(canvas.figure("loss_history", loss_histories(histories), alt, caption))
     return Part("Identification", blocks)
 
 
 def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]]]]) -> Figure:
-    """Draws the best loss so far over the evaluations of each start, with a panel for each identification.
+    """Draws the best loss so far over the evaluations of each start,
+    with a panel for each identification.
 
     The starts of an identification have a record with `loss` for each evaluation.
     """
@@ -92,11 +121,20 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
     for axes, (name, starts) in zip(panels, histories.items(), strict=True):
         ends = [record["loss"] for start in starts for record in start]
         for start in filter(None, starts):
-            losses = np.fmin.accumulate(np.array([record["loss"] for record in start], dtype=np.float64))
+            losses = np.fmin.accumulate(
+                np.array([record["loss"] for record in start], dtype=np.float64)
+            )
             best = bool(ends) and losses[-1] <= min(ends)
             tone, width = TONES["sysid" if best else "muted"].light, 1.8 if best else 0.9
             shown = figures.positive(losses)
-            axes.plot(np.arange(1, len(losses) + 1), shown, ".-", color=tone, linewidth=width, markersize=3.5)
+            axes.plot(
+                np.arange(1, len(losses) + 1),
+                shown,
+                ".-",
+                color=tone,
+                linewidth=width,
+                markersize=3.5,
+            )
         axes.set(title=MODELS[name].name, xlabel="evaluation")
         figures.count(axes.xaxis, 5)
     for axes in panels:  # Once everything is drawn, as they share their axis.
@@ -105,8 +143,13 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
     return figure
 
 
-def parameter_rows(identified: Identification, start: Mapping[str, float], truth: Mapping[str, float]) -> list[Row]:
-    """Returns a row for each parameter: values of data sheet, identification and truth if known; if at a bound."""
+def parameter_rows(
+    identified: Identification, start: Mapping[str, float], truth: Mapping[str, float]
+) -> list[Row]:
+    """Returns a row for each parameter: values of data sheet, identification and truth if known.
+
+    If at a bound.
+    """
     rows = []
     for parameter, value in identified.parameters.items():
         whole, owner = split_name(parameter)
@@ -121,14 +164,20 @@ def parameter_rows(identified: Identification, start: Mapping[str, float], truth
 
 
 def trials_table(identified: Identification) -> PageTable | None:
-    """Returns the values of single trials and sessions, with their standard deviations; None if there are none.
+    """Returns the values of single trials and sessions, with their standard deviations.
 
-    The parameters are the rows if they are more than the trials and sessions, as those of chambers in two sessions.
+    None if there are none.
+
+    The parameters are the rows if they are more than the trials and sessions, as those of chambers
+    in two sessions.
     """
     values, deviations = identified.of_trials, identified.of_trials_deviation
     if not values:
         return None
-    parameters = {parameter: parameter_wording(parameter) for parameter in (split_name(name)[0] for name in values)}
+    parameters = {
+        parameter: parameter_wording(parameter)
+        for parameter in (split_name(name)[0] for name in values)
+    }
     owners = list(dict.fromkeys(split_name(name)[1] for name in values))
     heads = [f"{words} [{unit}]" if unit else words for words, unit, _ in parameters.values()]
 
@@ -136,27 +185,54 @@ def trials_table(identified: Identification) -> PageTable | None:
         name = value_name(parameter, owner)
         return identified_cell(values.get(name), parameters[parameter][2], deviations.get(name))
 
-    note = " ".join(filter(None, ("Identified with the prior.", first_frames_text(identified.first_frames))))
+    note = " ".join(
+        filter(None, ("Identified with the prior.", first_frames_text(identified.first_frames)))
+    )
     if len(parameters) > len(owners):
-        rows = [Row(head, [cell(p, o) for o in owners]) for p, head in zip(parameters, heads, strict=True)]
+        rows = [
+            Row(head, [cell(p, o) for o in owners])
+            for p, head in zip(parameters, heads, strict=True)
+        ]
         return PageTable("Value by trial or session", owners, rows, note)
-    return PageTable("Trial or session", heads, [Row(o, [cell(p, o) for p in parameters]) for o in owners], note)
+    return PageTable(
+        "Trial or session", heads, [Row(o, [cell(p, o) for p in parameters]) for o in owners], note
+    )
 
 
 def first_frames_text(first_frames: Mapping[str, Mapping[str, float]]) -> str:
-    """Returns sentences on sessions and trials of which first frames give the values; empty without any."""
-    sessions = {owner: max(shown.values()) for owner, shown in first_frames.items() if owner not in shown}
+    """Returns sentences on sessions and trials of which first frames give the values.
+
+    Empty without any.
+    """
+    sessions = {
+        owner: max(shown.values()) for owner, shown in first_frames.items() if owner not in shown
+    }
     alone = [shown[owner] for owner, shown in first_frames.items() if owner in shown]
-    parts = [f"session {name} are estimated from the first {seconds:g} s of its" for name, seconds in sessions.items()]
-    parts += [f"held-out trials are estimated from the first {max(alone):g} s of these"] if alone else []
+    parts = [
+        f"session {name} are estimated from the first {seconds:g} s of its"
+        for name, seconds in sessions.items()
+    ]
+    parts += (
+        [f"held-out trials are estimated from the first {max(alone):g} s of these"] if alone else []
+    )
     return " ".join(f"Values of {part} trials, which do not count in the errors." for part in parts)
 
 
 def parameter_wording(parameter: str) -> Wording:
-    """Returns the name of a parameter as in the settings but with spaces, its unit on the page, and the factor."""
-    words = parameter.replace("_", " ").replace("youngs", "Young's").replace("poissons", "Poisson's")
-    names = (parameter, parameter.rpartition("_")[0])  # The second one is that of a part, such as pressure_delay_1.
-    fits = ((unit, factor) for name in names for pattern, unit, factor in _UNITS if re.fullmatch(pattern, name))
+    """Returns the name of a parameter as in the settings but with spaces,
+    its unit on the page, and the factor.
+    """
+    words = (
+        parameter.replace("_", " ").replace("youngs", "Young's").replace("poissons", "Poisson's")
+    )
+    # The second one is that of a part, such as pressure_delay_1.
+    names = (parameter, parameter.rpartition("_")[0])
+    fits = (
+        (unit, factor)
+        for name in names
+        for pattern, unit, factor in _UNITS
+        if re.fullmatch(pattern, name)
+    )
     return words[0].upper() + words[1:], *next(fits, ("", 1.0))
 
 
@@ -183,7 +259,9 @@ def identified_cell(value: float | None, factor: float, deviation: float | None)
 
 
 def digits(value: float | None, factor: float, deviation: float | None = None) -> str:
-    """Returns a value in its unit, with two digits of its standard deviation, or with four digits without one."""
+    """Returns a value in its unit, with two digits of its standard deviation,
+    or with four digits without one.
+    """
     if value is None:
         return NONE
     if not deviation:
@@ -193,18 +271,22 @@ def digits(value: float | None, factor: float, deviation: float | None = None) -
 
 
 def placement_text(name: str, placed: PlainPlacement, lengths: Mapping[str, float]) -> str:
-    """Returns a sentence on the identified displacements of markers and recordings from their nominal positions.
+    """Returns a sentence on the identified displacements of markers
+    and recordings from their nominal positions.
 
-    The angle of a rigid body is the root mean square displacement of its points over its length [m].
+    The angle of a rigid body is the root mean square displacement of its points over its length
+    [m].
     """
     labels, offsets = [*placed["offsets"]], np.array([*placed["offsets"].values()])
-    away = dict(zip(owners(labels), 1e3 * np.linalg.norm(as_markers(offsets, labels), axis=1), strict=True))
+    away = dict(
+        zip(owners(labels), 1e3 * np.linalg.norm(as_markers(offsets, labels), axis=1), strict=True)
+    )
     furthest = max(away, key=lambda label: away[label])
     shift, turn = math.hypot(*placed["shift"]), math.hypot(*placed["turn"])
     text = (
-        f"{MODELS[name].name}, identified with the parameters: markers are displaced from their nominal positions, "
-        f"{furthest} the most, by {away[furthest]:.1f} mm; the recordings are shifted by {1e3 * shift:.1f} mm and "
-        f"rotated by {math.degrees(turn):.1f}°"
+        f"{MODELS[name].name}, identified with the parameters: markers are displaced from their "
+        f"nominal positions, {furthest} the most, by {away[furthest]:.1f} mm; the recordings are "
+        f"shifted by {1e3 * shift:.1f} mm and rotated by {math.degrees(turn):.1f}°"
     )
     for body, corners in corners_of(labels).items():
         angle = root_mean_square(offsets[corners] - offsets[corners].mean(axis=0)) / lengths[body]
@@ -213,21 +295,33 @@ def placement_text(name: str, placed: PlainPlacement, lengths: Mapping[str, floa
     return text.replace(" mm", f"{NO_BREAK_SPACE}mm")
 
 
-def uncertainty_text(name: str, identified: Identification, settings: IdentifySettings | None) -> str:
-    """Returns sentences on the parameters of a model that the data do not determine; empty without uncertainties."""
+def uncertainty_text(
+    name: str, identified: Identification, settings: IdentifySettings | None
+) -> str:
+    """Returns sentences on the parameters of a model that the data do not determine.
+
+    Empty without uncertainties.
+    """
     uncertainty = identified.uncertainty
     if uncertainty is None:
         return ""
     names = list(identified.parameters)
     words = {parameter: in_sentence(parameter) for parameter in names}
     largest = max(abs(weight) for weight in uncertainty.poorest.values())
-    along = " with ".join(words[p] for p, weight in uncertainty.poorest.items() if abs(weight) > 0.4 * largest)
+    along = " with ".join(
+        words[p] for p, weight in uncertainty.poorest.items() if abs(weight) > 0.4 * largest
+    )
     share = 100.0 * uncertainty.poorest_deviation
     known = f"{along} is least certain ({share:.2g} % of the range)."
-    text = f"{MODELS[name].name}: {known if share < _WHOLE else f'the data do not constrain {along}: set a prior.'}"
+    text = (
+        f"{MODELS[name].name}: "
+        f"{known if share < _WHOLE else f'the data do not constrain {along}: set a prior.'}"
+    )
     correlation = np.array(uncertainty.correlation, dtype=np.float64)
     tied = [
-        f"{words[names[i]]} and {words[names[j]]} (correlation {correlation[i, j]:+.2f})".replace("-", MINUS)
+        f"{words[names[i]]} and {words[names[j]]} (correlation {correlation[i, j]:+.2f})".replace(
+            "-", MINUS
+        )
         for j in range(len(names))
         for i in range(j)
         if abs(correlation[i, j]) > _TIED
@@ -239,7 +333,9 @@ def uncertainty_text(name: str, identified: Identification, settings: IdentifySe
         prior = None if limits is None or limits.owner else limits.prior
         if prior is not None and deviation > _UNINFORMED * prior.deviation:
             _, unit, factor = parameter_wording(parameter)
-            where = f"{digits(prior.mean, factor)} ± {digits(prior.deviation, factor)} {unit}".rstrip()
+            where = (
+                f"{digits(prior.mean, factor)} ± {digits(prior.deviation, factor)} {unit}".rstrip()
+            )
             unknown.append(f"{words[parameter]} beyond its prior ({where})")
     text += f" The data do not constrain {', '.join(unknown)}." if unknown else ""
     return text.replace(" %", f"{NO_BREAK_SPACE}%")

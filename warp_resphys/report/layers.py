@@ -1,8 +1,8 @@
 """Scenes: layers of bodies, obstacles, markers and strings, seen by cameras without perspective.
 
-Every picture of a body is a scene: those of the report, films, pictures of environments (`render` draws them with
-pyvista), and the live view of a robot in the browser. Points are (P, 3),
-or (F, P, 3) where they move over F frames [m].
+Every picture of a body is a scene: those of the report, films, pictures of environments (`render`
+draws them with pyvista), and the live view of a robot in the browser. Points are (P, 3), or
+(F, P, 3) where they move over F frames [m].
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,9 @@ from ..io.arrays import FloatArray, IntArray
 from ..mesh.volume_mesh import Mesh, boundary_faces
 
 INK: Final = "#1c2127"
-OUTLINE: Final = "#808891"  # Of the undeformed body: a grey that is visible on light and dark pages.
+OUTLINE: Final = (
+    "#808891"  # Of the undeformed body: a grey that is visible on light and dark pages.
+)
 BODY: Final = "#8db4e8"
 BEHIND: Final = "#6b7580"  # Of bodies and markers with which the last one is compared.
 MEASURED: Final = "#d55e00"  # Vermilion of Okabe and Ito (2008).
@@ -29,17 +31,24 @@ _BEFORE: Final = 0.01  # Shift of edges to the viewer, over half the height of a
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """An object of a scene. Moving points have a first axis of F frames; it is not drawn where they are not finite."""
+    """An object of a scene. Moving points have a first axis of F frames.
 
-    kind: str  # surface, lines, balls, rings (towards the viewer), slice or slice_edges (of solid cells, by a plane).
-    points: FloatArray  # (P, 3) or (F, P, 3) [m] corners, or centres of balls and rings, which are hidden one by one.
+    It is not drawn where they are not finite.
+    """
+
+    kind: str  # surface, lines, balls, rings (towards the viewer), slice or slice_edges (of cells).
+    points: FloatArray  # (P, 3) or (F, P, 3) [m] corners, or centres, hidden one by one.
     cells: IntArray | None = None  # (S, 3) triangles, (E, 2) lines or (C, 4 | 8) solid cells.
     colour: str = INK
     size: float = 1.0  # Radius of balls and rings [m], or width of lines [px].
     opacity: float = 1.0
-    light: tuple[float, float] | None = None  # Shares of ambient and scene light; None draws the plain colour.
+    light: tuple[float, float] | None = (
+        None  # Shares of ambient and scene light; None draws the plain colour.
+    )
     shift: float = 0.0  # Towards the viewer [m].
-    plane: FloatArray | None = None  # (2, 3) normal and point of a plane; of a surface, the part behind it is drawn.
+    plane: FloatArray | None = (
+        None  # (2, 3) normal and point of a plane; of a surface, the part behind it is drawn.
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +69,9 @@ class RenderScene:
     views: Sequence[View]
     size: Sequence[int]  # (2,) width and height of each view [px]; even for a film.
     background: str | None = None  # A colour; None for a transparent one.
-    sorts: bool = False  # Whether translucent surfaces are sorted by depth, which excludes smooth edges.
+    sorts: bool = (
+        False  # Whether translucent surfaces are sorted by depth, which excludes smooth edges.
+    )
     texts: Sequence[str] = ()  # One for each frame, in the first view, before its legend.
     fps: float = LARGEST_RATE  # Of a film.
 
@@ -83,24 +94,38 @@ def body_layers(
         sharp: (E, 2) edges; by default those of the first frame.
         width: Of its sharp edges [px].
     """
-    sharp = sharp_edges(points if points.ndim == 2 else points[0], triangles) if sharp is None else sharp
+    sharp = (
+        sharp_edges(points if points.ndim == 2 else points[0], triangles)
+        if sharp is None
+        else sharp
+    )
     before = _BEFORE * half
     thin = [] if edges is None else [Layer("lines", points, edges, opacity=0.3, shift=before)]
     solid = Layer("surface", points, triangles, BODY, light=_BODY_LIGHT)
     return [solid, *thin, Layer("lines", points, sharp, size=width, shift=before)]
 
 
-def ghost_layers(points: FloatArray, triangles: IntArray, half: float, sharp: IntArray) -> list[Layer]:
-    """Returns layers of a translucent body with which a solid one is compared, as those of `body_layers`.
+def ghost_layers(
+    points: FloatArray, triangles: IntArray, half: float, sharp: IntArray
+) -> list[Layer]:
+    """Returns layers of a translucent body with which a solid one is compared,
+    as those of `body_layers`.
 
     Its surface is shifted far behind, so that it shows beside the solid body only.
     """
-    surface = Layer("surface", points, triangles, BEHIND, opacity=0.3, light=_BODY_LIGHT, shift=-4.0 * half)
+    surface = Layer(
+        "surface", points, triangles, BEHIND, opacity=0.3, light=_BODY_LIGHT, shift=-4.0 * half
+    )
     return [surface, Layer("lines", points, sharp, BEHIND, size=2.0, shift=_BEFORE * half)]
 
 
-def obstacle_layers(points: FloatArray, triangles: IntArray, width: float = 1.5, colour: str = OBSTACLE) -> list[Layer]:
-    """Returns layers of obstacles, with lines [px wide] along their sharp edges; none without triangles."""
+def obstacle_layers(
+    points: FloatArray, triangles: IntArray, width: float = 1.5, colour: str = OBSTACLE
+) -> list[Layer]:
+    """Returns layers of obstacles, with lines [px wide] along their sharp edges.
+
+    None without triangles.
+    """
     if not len(triangles):
         return []
     edges = sharp_edges(points if points.ndim == 2 else points[0], triangles)
@@ -130,7 +155,9 @@ def face_edges(mesh: Mesh) -> IntArray:
 
 
 def sharp_edges(points: FloatArray, triangles: IntArray) -> IntArray:
-    """Returns edges (E, 2) at which triangles (S, 3) of points (P, 3) meet at a sharp angle, or a surface ends."""
+    """Returns edges (E, 2) at which triangles (S, 3) of points (P, 3) meet
+    at a sharp angle, or a surface ends.
+    """
     corners = points[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -139,7 +166,9 @@ def sharp_edges(points: FloatArray, triangles: IntArray) -> IntArray:
     together = np.zeros((len(edges), 3))
     np.add.at(together, which.ravel(), np.repeat(normals, 3, axis=0))
     # Two unit vectors at an angle a have a sum of length 2 cos(a / 2).
-    smooth = (count == 2) & (np.linalg.norm(together, axis=1) >= 2.0 * np.cos(0.5 * np.radians(_SHARP)))
+    smooth = (count == 2) & (
+        np.linalg.norm(together, axis=1) >= 2.0 * np.cos(0.5 * np.radians(_SHARP))
+    )
     return np.asarray(edges[~smooth])
 
 

@@ -10,7 +10,17 @@ from ..data.camera import frame_of, height_of, motion_axes
 from ..dynamics.trajectory import Motion
 from ..io.errors import InputError, checks_types
 from ..mesh.volume_mesh import boundary_triangles
-from .layers import MEASURED, Layer, RenderScene, View, body_layers, face_edges, obstacle_layers, pace, sharp_edges
+from .layers import (
+    MEASURED,
+    Layer,
+    RenderScene,
+    View,
+    body_layers,
+    face_edges,
+    obstacle_layers,
+    pace,
+    sharp_edges,
+)
 from .render import DrawingError, write_film
 
 _SIZE: Final = (720, 560)  # px
@@ -20,7 +30,11 @@ _BEFORE: Final = 5.0  # shift of the markers to the viewer, over the same
 
 @checks_types
 def film(
-    motion: Motion, path: str | Path, environment: int = 0, slower: float = 1.0, gravity: ArrayLike = (0.0, 0.0, -1.0)
+    motion: Motion,
+    path: str | Path,
+    environment: int = 0,
+    slower: float = 1.0,
+    gravity: ArrayLike = (0.0, 0.0, -1.0),
 ) -> Path:
     """Writes a film (MP4) of a motion, of its body with its markers and obstacles.
 
@@ -35,7 +49,8 @@ def film(
         The path.
 
     Raises:
-        InputError: an unknown environment, a motion without steps, another extension, or a machine that cannot draw.
+        InputError: an unknown environment, a motion without steps, another extension, or a machine
+            that cannot draw.
         DataFileError: the file cannot be written.
     """
     path = Path(path).expanduser()
@@ -57,7 +72,9 @@ def _scene(motion: Motion, environment: int, slower: float, gravity: np.ndarray)
     markers = motion.of_environment(motion.labelled, environment)[frames]
     obstacles = motion.surface(environment).at(frames)
     members = [*motion.body.members]
-    triangles = np.concatenate([boundary_triangles(body.mesh) + first for _, body, first in members])
+    triangles = np.concatenate(
+        [boundary_triangles(body.mesh) + first for _, body, first in members]
+    )
     edges = np.concatenate([face_edges(body.mesh) + first for _, body, first in members])
     sharp = sharp_edges(motion.body.vertices, triangles)
     axes, points = motion_axes(gravity, q), np.concatenate([q, markers], axis=1).reshape(-1, 3)
@@ -66,6 +83,10 @@ def _scene(motion: Motion, environment: int, slower: float, gravity: np.ndarray)
     layers = obstacle_layers(obstacles.points, obstacles.triangles)
     layers += body_layers(q, triangles, height, edges, sharp if len(sharp) else edges)
     if markers.shape[1]:
-        layers.append(Layer("balls", markers, None, MEASURED, size=_DOT * height, shift=_BEFORE * height))
+        layers.append(
+            Layer("balls", markers, None, MEASURED, size=_DOT * height, shift=_BEFORE * height)
+        )
     texts = [f"{time:.2f} s" for time in motion.times[frames]]
-    return RenderScene([View(layers, axes, middle, height)], _SIZE, background="white", texts=texts, fps=fps)
+    return RenderScene(
+        [View(layers, axes, middle, height)], _SIZE, background="white", texts=texts, fps=fps
+    )

@@ -1,8 +1,8 @@
 """The section of the page of a run on the motion in a trial: a film, a view in space, and pictures.
 
-The view in space is turned and played in a browser (`view.js`). Vertices of a motion are stored for it in a reduced
-basis: rest positions, singular vectors of the displacements of all models, and their weights in each frame. Ten seconds
-of an arm take a few hundred kilobytes.
+The view in space is turned and played in a browser (`view.js`). Vertices of a motion are stored for
+it in a reduced basis: rest positions, singular vectors of the displacements of all models, and
+their weights in each frame. Ten seconds of an arm take a few hundred kilobytes.
 """
 
 import base64
@@ -23,7 +23,14 @@ from ..io.arrays import FloatArray
 from ..learning.metrics import mean_distance
 from ..mesh.volume_mesh import boundary_triangles, surface_vertices
 from . import figures
-from .body_motions import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion, hangs, without_diverged
+from .body_motions import (
+    LABORATORY_MARKERS,
+    MEASURED_MARKERS,
+    TARGET_VERTICES,
+    ComparedMotion,
+    hangs,
+    without_diverged,
+)
 from .data import Film, RunReport, at_times, shown_markers, spread
 from .layers import MEASURED, OBSTACLE, OUTLINE, face_edges, sharp_edges
 from .page import Block, Canvas, Drawn, Part, ShownModel, ViewInSpace
@@ -34,14 +41,17 @@ _MOST_POINTS: Final = 6  # Vertices of the tip that are shown, where every verte
 _MOST_FRAMES: Final = 256  # Of the view in space.
 _TOLERANCE: Final = 2e-4  # Largest error of a vertex of the view in space, over the body's size,
 _MOST_MODES: Final = 96  # unless it takes more modes than these.
-_DIVERGED: Final = 3.0  # Distance from rest beyond which a body is not drawn there, over the body's size.
+_DIVERGED: Final = (
+    3.0  # Distance from rest beyond which a body is not drawn there, over the body's size.
+)
 _COLOUR_MAP: Final = "viridis"
 _STOPS: Final = 32  # Of the colour map.
 _LEVELS: Final = 255  # Of the errors of a model, from zero to the largest.
 
 
 def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion | None:
-    """Returns the motion that is drawn: that of the film or, where vertices are observed, of the worst trial.
+    """Returns the motion that is drawn: that of the film or,
+    where vertices are observed, of the worst trial.
 
     It has the two models that are compared in pictures, or every model.
     """
@@ -52,16 +62,21 @@ def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion |
     points = None
     if not trials.labels:
         row = trials.worst
-        film = Film(trials.names[row], trials.times[row], {m: q[row] for m, q in trials.positions.items()})
+        film = Film(
+            trials.names[row], trials.times[row], {m: q[row] for m, q in trials.positions.items()}
+        )
         points = data.tip if len(data.tip) else np.flatnonzero(away >= away.max() - 1e-9)
         points = spread(points, _MOST_POINTS)
     if film is None or film.trial not in trials.names:
         return None
-    row, models = trials.names.index(film.trial), shown_models(film.positions, data.metrics.get("recommended", ""))
+    row = trials.names.index(film.trial)
+    models = shown_models(film.positions, data.metrics.get("recommended", ""))
     if not models:
         return None
     if every_model:
-        models = [model for model in MODELS if model in film.positions and model in trials.positions]
+        models = [
+            model for model in MODELS if model in film.positions and model in trials.positions
+        ]
     points = shown_markers(trials.target[row]) if points is None else points
     times = trials.times[row]
     frames = np.flatnonzero(np.append(True, np.diff(times) > 0.0))
@@ -90,16 +105,26 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
     if motion is None or trials is None:
         return None
     models, best = list(motion.positions), data.metrics.get("recommended", "")
-    name = data.film.trial if data.film is not None and data.sees_markers else trials.names[trials.worst]
+    name = (
+        data.film.trial
+        if data.film is not None and data.sees_markers
+        else trials.names[trials.worst]
+    )
     colours = f"Grey: {MODELS[models[0]].name}. " if len(models) > 1 else ""
     colours += f"Blue: {MODELS[models[-1]].name}{', the recommended model' * (models[-1] == best)}."
     blocks: list[Block] = []
-    # A film takes longer than the rest of the page; where vertices are observed, it adds nothing to the instants.
+    # A film takes longer than the rest of the page; where vertices are observed, it adds nothing to
+    # the instants.
     if data.sees_markers and len(motion.times) > 1:
-        views = "from the side and from below" if motion.from_below else "the whole body, and its markers from nearby"
+        views = (
+            "from the side and from below"
+            if motion.from_below
+            else "the whole body, and its markers from nearby"
+        )
         pace = "four times slower than real time" if motion.is_fast else "in real time"
         caption = Markup(
-            "The trial {}, {}: {}. {} Dots: {}; rings: simulated. The film lies in <code>figures/motion.mp4</code>."
+            "The trial {}, {}: {}. {} Dots: {}; rings: simulated. The film lies in "
+            "<code>figures/motion.mp4</code>."
         ).format(name, pace, views, colours, motion.observed)
         alt = "The simulated bodies and what was observed, in motion"
         blocks.append(
@@ -126,14 +151,18 @@ def _in_space(data: RunReport, name: str) -> list[Block]:
     if motion is None:
         return []
     motion = motion.at(spread(np.arange(len(motion.times)), _MOST_FRAMES))
-    compared, against = ("markers", "the measured ones") if data.sees_markers else ("vertices", "the target")
+    compared, against = (
+        ("markers", "the measured ones") if data.sees_markers else ("vertices", "the target")
+    )
     caption = (
-        f"The trial {name} in space: drag to turn, with Shift to move, pinch or scroll to zoom; arrow keys turn, plus "
-        f"and minus zoom, the space bar plays, comma and full stop step, 0 resets. Colours show the distance of the "
-        f"{compared} of the solid body from {against}, from zero to the largest in this trial."
+        f"The trial {name} in space: drag to turn, with Shift to move, pinch or scroll to zoom; "
+        "arrow keys turn, plus and minus zoom, the space bar plays, comma and full stop step, 0 "
+        f"resets. Colours show the distance of the {compared} of the solid body from {against}, "
+        "from zero to the largest in this trial."
     )
     alt = (
-        f"An interactive view of the bodies of {', '.join(MODELS[model].name for model in motion.positions)} in motion."
+        "An interactive view of the bodies of "
+        f"{', '.join(MODELS[model].name for model in motion.positions)} in motion."
     )
     shown = shown_models(motion.positions, data.metrics.get("recommended", ""))
     return [view_in_space("view", motion, shown, unbroken(caption), alt)]
@@ -144,11 +173,19 @@ def _instants_figure(
 ) -> Drawn:
     """Shows the body at a few instants (F, H, 2 W, 4), each with a second view of its markers."""
     titles = [f"{motion.times[frame]:.2f} s" for frame in motion.instants]
-    caption, when = f"{name} at {len(titles)} instants, one with the largest error of the grey body.", ", ".join(titles)
+    caption = f"{name} at {len(titles)} instants, one with the largest error of the grey body."
+    when = ", ".join(titles)
     if len(motion.times) == 1:  # A pose.
         titles, caption, when = [""], f"{name}.", "rest"
-    caption += f" Drawn to scale; {'below, the view from below' if motion.from_below else 'the second view follows'}"
-    caption += "." if motion.from_below else (" the markers." if data.sees_markers else " some vertices of the tip.")
+    caption += (
+        " Drawn to scale; "
+        f"{'below, the view from below' if motion.from_below else 'the second view follows'}"
+    )
+    caption += (
+        "."
+        if motion.from_below
+        else (" the markers." if data.sees_markers else " some vertices of the tip.")
+    )
     if not data.sees_markers:
         caption += f" {colours} Dots: the target’s tip; rings: simulated."  # noqa: RUF001
     last = list(motion.positions)[-1]
@@ -166,7 +203,9 @@ def _instants_figure(
     return canvas.figure("motion", figure, alt, caption)
 
 
-def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], caption: str, alt: str) -> ViewInSpace:
+def view_in_space(
+    name: str, motion: ComparedMotion, shown: Sequence[str], caption: str, alt: str
+) -> ViewInSpace:
     """Returns the view of all bodies of a motion, of which some models are shown at first.
 
     With a target, vertices are compared with it; without one, markers are compared.
@@ -175,7 +214,8 @@ def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], capti
     rest, faces = mesh.vertices[surface], np.searchsorted(surface, boundary_triangles(mesh))
     size = float(np.ptp(mesh.vertices, axis=0).max())
     finite = partial(without_diverged, far=_DIVERGED * size)
-    places = np.stack([finite(q[:, surface], rest) for q in motion.positions.values()])  # (B, F, S, 3)
+    # (B, F, S, 3)
+    places = np.stack([finite(q[:, surface], rest) for q in motion.positions.values()])
     axes = motion_axes(motion.gravity, np.concatenate([rest[None], *places]))
     points = np.concatenate([rest, places.reshape(-1, 3)])
     centre, half = frame_of(np.concatenate([points, obstacles.near(points)]), axes)
@@ -219,13 +259,18 @@ def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], capti
         "ink": TONES["ink"]._asdict(),
         **{"outline": OUTLINE, "solid": OBSTACLE, "seen": MEASURED},
     }
-    payload = Markup(json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))
+    payload = Markup(
+        json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    )
     kind, speed = "markers" if has_markers else "vertices", 0.25 if motion.is_fast else 1.0
     return ViewInSpace(name, caption, alt, payload, models, len(motion.times), speed, kind)
 
 
-def _error_shares(simulated: FloatArray, target: FloatArray, places: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The largest distances (B,) [mm] of points (B, F, P, 3) from a target (F, P, 3), and all over it, up to `_LEVELS`.
+def _error_shares(
+    simulated: FloatArray, target: FloatArray, places: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The largest distances (B,) [mm] of points (B, F, P, 3) from a target (F, P, 3),
+    and all over it, up to `_LEVELS`.
 
     Frames in which a body (B, F, S, 3) is not drawn do not count.
     """
@@ -238,29 +283,39 @@ def _error_shares(simulated: FloatArray, target: FloatArray, places: FloatArray)
 
 
 def _encoded_motion(displacements: FloatArray, size: float) -> dict[str, Any]:
-    """Basis of displacements (B, F, S, 3) of bodies of a size [m], with its scales, and their weights."""
+    """Basis of displacements (B, F, S, 3) of bodies of a size [m],
+    with its scales, and their weights.
+    """
     basis, weights = reduced(displacements, _TOLERANCE * size, _MOST_MODES)
-    scales = np.maximum(np.abs(basis).max(axis=1), np.finfo(np.float32).tiny) / np.iinfo(np.int16).max
+    scales = (
+        np.maximum(np.abs(basis).max(axis=1), np.finfo(np.float32).tiny) / np.iinfo(np.int16).max
+    )
     modes = _encoded(np.rint(basis / scales[:, None]), "<i2")
     return {"modes": modes, "scales": scales.tolist(), "weights": _encoded(weights, "<f4")}
 
 
-def reduced(displacements: FloatArray, tolerance: float, most: int) -> tuple[FloatArray, FloatArray]:
-    """Returns the fewest singular vectors (K, 3 S) that represent displacements, and their weights (B, F, K).
+def reduced(
+    displacements: FloatArray, tolerance: float, most: int
+) -> tuple[FloatArray, FloatArray]:
+    """Returns the fewest singular vectors (K, 3 S) that represent displacements,
+    and their weights (B, F, K).
 
     Args:
-        displacements: (B, F, S, 3) [m] of S points in F frames of B bodies, NaN in frames that are left out.
+        displacements: (B, F, S, 3) [m] of S points in F frames of B bodies, NaN in frames that are
+            left out.
         tolerance: Largest error of a coordinate [m], unless it takes more vectors than `most`.
         most: Largest number of vectors.
 
     Returns:
-        Vectors of unit length, or one of zeros for bodies at rest, and weights [m], NaN in frames that are left out.
+        Vectors of unit length, or one of zeros for bodies at rest, and weights [m], NaN in frames
+        that are left out.
     """
     count, frames, *_ = displacements.shape
     rows = displacements.reshape(count * frames, -1)
     finite = np.isfinite(rows).all(axis=1)
     remaining = rows[finite].copy()
-    _, left = np.linalg.eigh(remaining @ remaining.T)  # Most often there are fewer frames than coordinates.
+    # Most often there are fewer frames than coordinates.
+    _, left = np.linalg.eigh(remaining @ remaining.T)
     basis = np.empty((0, rows.shape[1]))
     while len(basis) < min(most, left.shape[1]) and np.abs(remaining).max(initial=0.0) > tolerance:
         vector = left[:, -1 - len(basis)] @ remaining
@@ -276,4 +331,6 @@ def reduced(displacements: FloatArray, tolerance: float, most: int) -> tuple[Flo
 
 def _encoded(values: npt.ArrayLike, kind: str) -> str:
     """Encodes numbers for the script of the page."""
-    return base64.b64encode(np.ascontiguousarray(values, dtype=np.dtype(kind)).tobytes()).decode("ascii")
+    return base64.b64encode(np.ascontiguousarray(values, dtype=np.dtype(kind)).tobytes()).decode(
+        "ascii"
+    )

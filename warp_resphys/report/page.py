@@ -1,4 +1,6 @@
-"""Self-contained HTML pages of sections, which have texts, lists, tables, figures, films and views in space."""
+"""Self-contained HTML pages of sections, which have texts, lists,
+tables, figures, films and views in space.
+"""
 
 import base64
 import hashlib
@@ -32,7 +34,8 @@ _TIMED: Final = {  # Models whose computing times are shown.
     "resphys": "Simulation with the learned force",
     "inference": "of which the network",
 }
-_WIDEST, _NARROW = 1000, 78  # characters: beyond every table; terminals below it wrap the heads of rows as well
+# Characters: beyond every table; terminals below it wrap the heads of rows as well.
+_WIDEST, _NARROW = 1000, 78
 Result = TypeVar("Result")
 
 
@@ -74,7 +77,12 @@ class PageTable:
     @classmethod
     def plain(cls, title: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> "PageTable":
         """Returns a table of texts, without small print."""
-        return cls(heads[0], heads[1:], [Row(first, [*map(Cell, cells)]) for first, *cells in rows], summary=title)
+        return cls(
+            heads[0],
+            heads[1:],
+            [Row(first, [*map(Cell, cells)]) for first, *cells in rows],
+            summary=title,
+        )
 
     @property
     def marked(self) -> bool:
@@ -84,7 +92,10 @@ class PageTable:
     def __rich_console__(
         self, console: "rich.console.Console", options: "rich.console.ConsoleOptions"
     ) -> Iterator[Any]:
-        """Yields the table for a terminal, without lines; where it is too wide, its heads are wrapped."""
+        """Yields the table for a terminal, without lines.
+
+        Where it is too wide, its heads are wrapped.
+        """
         from rich.text import Text as Plain
 
         table, wide = self._drawn(self.head, True), options.update(max_width=_WIDEST)
@@ -100,14 +111,20 @@ class PageTable:
         from rich.text import Text as Plain  # "[mm]" is no markup.
 
         title = Plain(self.summary) if self.summary else None
-        table = rich.table.Table(title=title, title_justify="left", box=None, padding=(0, 2, 0, 0), pad_edge=False)
+        table = rich.table.Table(
+            title=title, title_justify="left", box=None, padding=(0, 2, 0, 0), pad_edge=False
+        )
         table.add_column(Plain(head), no_wrap=whole)
         for column in self.columns:
             table.add_column(Plain(column), justify="right")
         for row in self.rows:
-            cells = (" ".join(filter(None, (cell.text, cell.beside, cell.small))) for cell in row.cells)
+            cells = (
+                " ".join(filter(None, (cell.text, cell.beside, cell.small))) for cell in row.cells
+            )
             marked = [row.mark] if self.marked else []
-            table.add_row(*map(Plain, (row.head, *cells, *marked)), style="bold" if row.mark else None)
+            table.add_row(
+                *map(Plain, (row.head, *cells, *marked)), style="bold" if row.mark else None
+            )
         return table
 
 
@@ -182,10 +199,13 @@ class ViewInSpace:
 
 @dataclass(frozen=True)
 class Rendered:
-    """A picture or a film that the drawing process is working on; its block is made once all sections are."""
+    """A picture or a film that the drawing process is working on.
+
+    Its block is made once all sections are.
+    """
 
     path: Path  # Of its file.
-    finish: Callable[[], Drawn]  # Waits for the process; raises a DrawingError where this machine cannot draw.
+    finish: Callable[[], Drawn]  # Waits for the process; raises a DrawingError if it cannot draw.
 
 
 Block = Text | Items | PageTable | Drawn | ViewInSpace | Rendered
@@ -205,15 +225,19 @@ class Canvas:
 
     folder: Path  # Of their files.
     renderer: Renderer = field(default_factory=Renderer)  # Of pictures of bodies.
-    pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1))  # Waits for the renderer.
+    pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1))  # Waits for it.
 
     def figure(self, name: str, figure: "Figure", alt: str, caption: str) -> Drawn:
-        """Returns a figure with its description and caption, and saves it as a PNG file of its name too."""
+        """Returns a figure with its description and caption,
+        and saves it as a PNG file of its name too.
+        """
         from . import figures
 
         figures.settle(figure)
         figures.save_png(figure, self.folder / f"{name}.png")
-        return Drawn(name, caption, alt, _address(figures.themed_svg(figure, name), "image/svg+xml"))
+        return Drawn(
+            name, caption, alt, _address(figures.themed_svg(figure, name), "image/svg+xml")
+        )
 
     def rendered(
         self, file: str, draw: Callable[[Renderer], Result], finish: Callable[[Path, Result], Drawn]
@@ -238,10 +262,10 @@ def write_page(
     metrics: Usage,
     conditions: Sequence[str] = (),
 ) -> None:
-    """Draws the sections and writes their page, with the files of its figures in `figures/` beside it.
+    """Draws the sections and writes their page, with files of its figures in `figures/` beside it.
 
-    The page is written to a temporary file first, so that it is never incomplete. Pictures that cannot be drawn on this
-    machine are replaced by a sentence with the reason.
+    The page is written to a temporary file first, so that it is never incomplete. Pictures that
+    cannot be drawn on this machine are replaced by a sentence with the reason.
 
     Args:
         path: The page's file, such as `report.html`; missing folders are made.
@@ -263,11 +287,16 @@ def write_page(
         folder.mkdir(parents=True, exist_ok=True)
         with figures.in_style(), ThreadPoolExecutor(1) as pool, Renderer() as renderer:
             canvas = Canvas(folder, renderer, pool)
-            parts = [*_finished([part for part in sections(canvas) if part is not None]), *_times(metrics)]
+            parts = [
+                *_finished([part for part in sections(canvas) if part is not None]),
+                *_times(metrics),
+            ]
     except OSError as error:
         if is_disk_full(error):
             raise disk_full_error(folder) from error
-        raise DataFileError(f"cannot write figures to {folder}: {error.strerror or error}") from error
+        raise DataFileError(
+            f"cannot write figures to {folder}: {error.strerror or error}"
+        ) from error
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("warp_resphys", "report"),
         undefined=jinja2.StrictUndefined,
@@ -275,7 +304,8 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    script, digest = "", ""  # The script that some blocks need, and its digest for the content security policy.
+    # The script that some blocks need, and its digest for the content security policy.
+    script, digest = "", ""
     if any(isinstance(block, ViewInSpace) for part in parts for block in part.blocks):
         script = resources.files(__package__).joinpath("view.js").read_text(encoding="utf-8")
         digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
@@ -296,7 +326,8 @@ def write_page(
 
 
 def _finished(parts: Sequence[Part]) -> Iterator[Part]:
-    """Yields the sections with their pictures of bodies, or a sentence why there are none, once for each reason.
+    """Yields the sections with their pictures of bodies,
+    or a sentence why there are none, once for each reason.
 
     Where one cannot be drawn, the file of an earlier page is removed.
     """
@@ -325,11 +356,19 @@ def _times(metrics: Usage) -> Iterator[Part]:
         stages = {**seconds, "Sum, also of stages that ran at once": sum(seconds.values())}
         rows = [Row(stage, [Cell(duration_text(spent))]) for stage, spent in stages.items()]
         one = metrics.get("seconds_per_test_trajectory", {})
-        timed = [Row(name, [Cell(duration_text(one[m]["mean"]))]) for m, name in _TIMED.items() if m in one]
+        timed = [
+            Row(name, [Cell(duration_text(one[m]["mean"]))])
+            for m, name in _TIMED.items()
+            if m in one
+        ]
         tables = [PageTable("Stage", ["Wall time"], rows)]
         tables += [PageTable("One test trial at a time", ["Wall time"], timed)] if timed else []
         peak = metrics["peak_memory_gib"]
-        memory = [] if peak is None else [Text(f"Peak memory: {peak:.2f}{NO_BREAK_SPACE}GiB.", note=True)]
+        memory = (
+            []
+            if peak is None
+            else [Text(f"Peak memory: {peak:.2f}{NO_BREAK_SPACE}GiB.", note=True)]
+        )
         yield Part("Time taken", [*tables, *memory])
 
 

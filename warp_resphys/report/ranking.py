@@ -1,7 +1,9 @@
-"""Models ranked by their errors [mm] on the same held-out trials: the best, the simplest as good, the recommended.
+"""Models ranked by their errors [mm] on the same held-out trials:
+the best, the simplest as good, the recommended.
 
-Errors are means over the trials, of which every one counts alike. Two models are compared by a paired bootstrap over
-the trials, which gives an interval from five trials on (`LEAST_TRIALS`); less error is claimed from three on.
+Errors are means over the trials, of which every one counts alike. Two models are compared by a
+paired bootstrap over the trials, which gives an interval from five trials on (`LEAST_TRIALS`); less
+error is claimed from three on.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -18,9 +20,12 @@ LEAST_TRIALS: Final = 5  # with which an interval over trials is given
 LEAST_EVIDENCE: Final = 3  # trials with which less error is claimed
 CORRECTED: Final = ("sysid_elastic", "sysid", "law", "actuator", "resphys_uncorrected", "resphys")
 SIMULATORS: Final = ("simulation", *CORRECTED)
-RANKED: Final = (*BASELINES, *SIMULATORS[:-2], "simfree", *SIMULATORS[-2:])  # from the simplest one on
+# From the simplest one on.
+RANKED: Final = (*BASELINES, *SIMULATORS[:-2], "simfree", *SIMULATORS[-2:])
 EQUAL: Final = 0.005  # share of an error below which there is no difference
-_SIMPLER: Final = 0.1  # share of an error that a simpler model may add, where the difference is not significant
+_SIMPLER: Final = (
+    0.1  # share of an error that a simpler model may add, where the difference is not significant
+)
 
 Known = Mapping[str, Sequence[float]]  # errors of the models whose roll-outs are all defined [mm]
 
@@ -28,19 +33,35 @@ Known = Mapping[str, Sequence[float]]  # errors of the models whose roll-outs ar
 def known_errors(errors: Errors, without: Collection[str] = ()) -> Known:
     """Returns the errors of the models whose roll-outs are all defined, without some models."""
     finite = {
-        m: [x for x in values if x is not None] for m, values in errors.items() if m in RANKED and m not in without
+        m: [x for x in values if x is not None]
+        for m, values in errors.items()
+        if m in RANKED and m not in without
     }
-    return {model: values for model, values in finite.items() if values and len(values) == len(errors[model])}
+    return {
+        model: values
+        for model, values in finite.items()
+        if values and len(values) == len(errors[model])
+    }
 
 
 def best_of(known: Known, models: Collection[str]) -> str:
-    """Returns the model of least mean error among some, the simplest of equal ones; empty without one."""
-    return min((m for m in RANKED if m in known and m in models), key=lambda m: fmean(known[m]), default="")
+    """Returns the model of least mean error among some, the simplest of equal ones.
+
+    Empty without one.
+    """
+    return min(
+        (m for m in RANKED if m in known and m in models), key=lambda m: fmean(known[m]), default=""
+    )
 
 
 def best_pair(known: Known) -> tuple[str, str]:
-    """Returns the corrected model of least mean error, and the best of all others; empty where there is none."""
-    return best_of(known, CORRECTED), best_of(known, [model for model in RANKED if model not in CORRECTED])
+    """Returns the corrected model of least mean error, and the best of all others.
+
+    Empty where there is none.
+    """
+    return best_of(known, CORRECTED), best_of(
+        known, [model for model in RANKED if model not in CORRECTED]
+    )
 
 
 def compared(before: Sequence[float], after: Sequence[float]) -> Gain:
@@ -49,15 +70,22 @@ def compared(before: Sequence[float], after: Sequence[float]) -> Gain:
 
 
 def is_clear(gain: Gain) -> bool:
-    """Returns whether the 90 % interval of a gain excludes zero, or there are too few trials for an interval."""
+    """Returns whether the 90 % interval of a gain excludes zero,
+    or there are too few trials for an interval.
+    """
     return gain.trials < LEAST_TRIALS or gain.lower > 0.0
 
 
 def simplest(known: Known, models: Collection[str] = RANKED) -> str:
-    """Returns the simplest of some models that is not clearly worse than the best of them; empty without one."""
+    """Returns the simplest of some models that is not clearly worse than the best of them.
+
+    Empty without one.
+    """
     best = best_of(known, models)
     among = [model for model in RANKED if model in known and model in models]
-    return next((model for model in among if model == best or _as_good(known[model], known[best])), "")
+    return next(
+        (model for model in among if model == best or _as_good(known[model], known[best])), ""
+    )
 
 
 def _as_good(errors: Sequence[float], best: Sequence[float]) -> bool:
@@ -66,21 +94,27 @@ def _as_good(errors: Sequence[float], best: Sequence[float]) -> bool:
 
 
 def unused(metrics: Metrics) -> dict[str, str]:
-    """Returns why learned models are not used, by model: in no fold are they clearly closer to held-out trials."""
+    """Returns why learned models are not used, by model:
+    in no fold are they clearly closer to held-out trials.
+    """
     tests: dict[str, list[HeldOutTest]] = {}
     for fold in folds_in(metrics):
         for model, kept in fold.get("networks", {}).items():
             if (test := kept.get("test")) is not None:
                 tests.setdefault(model, []).append(test)
     return {
-        model: text_of(found[0]) if len(found) == 1 else f"it is clearly closer in none of the {len(found)} folds"
+        model: text_of(found[0])
+        if len(found) == 1
+        else f"it is clearly closer in none of the {len(found)} folds"
         for model, found in tests.items()
         if not any(test["used"] for test in found)
     }
 
 
 def shown_metrics(metrics: Metrics) -> Metrics:
-    """Returns the metrics without ResPhys where no force is learned, as it then is the simulator below it."""
+    """Returns the metrics without ResPhys where no force is learned,
+    as it then is the simulator below it.
+    """
     if not any(fold.get("without_forces") for fold in folds_in(metrics)):
         return metrics
     shown: Metrics = _without(metrics, "resphys")
@@ -95,10 +129,11 @@ def _without(content: Any, key: str) -> Any:
 
 
 def recommended(metrics: Metrics, settings: RunSettings) -> str:
-    """Returns the simulator that a run recommends: the simplest one that is not clearly worse than the best.
+    """Returns the simulator that a run recommends: the simplest one
+    that is not clearly worse than the best.
 
-    The test trials beyond the training loads decide, where there are some. What was learned and is not used, and what
-    diverged, is not recommended.
+    The test trials beyond the training loads decide, where there are some. What was learned and is
+    not used, and what diverged, is not recommended.
 
     Args:
         metrics: of a split or of folds.

@@ -1,8 +1,8 @@
 """Pictures and films of scenes, drawn with pyvista off screen in a process of their own.
 
-Without a working OpenGL driver, VTK ends its process. Hence pyvista is imported in a separate process only, whose
-program is `main`: it reads scenes from stdin until that is closed, and writes the pixels of every frame to stdout, and
-None after each scene.
+Without a working OpenGL driver, VTK ends its process. Hence pyvista is imported in a separate
+process only, whose program is `main`: it reads scenes from stdin until that is closed, and writes
+the pixels of every frame to stdout, and None after each scene.
 """
 
 import logging
@@ -41,7 +41,19 @@ _PEELS: Final = 12  # Sorted layers of translucent surfaces.
 _SAMPLES: Final = 8  # Samples a pixel, in scenes that are not sorted.
 _CORNERS: Final = 48  # Of a ring.
 _RING_WIDTH: Final = 2.5  # [px]
-_CODEC: Final = ["-f", "mp4", "-crf", "23", "-preset", "fast", "-threads", "1", "-movflags", "+faststart", "-bitexact"]
+_CODEC: Final = [
+    "-f",
+    "mp4",
+    "-crf",
+    "23",
+    "-preset",
+    "fast",
+    "-threads",
+    "1",
+    "-movflags",
+    "+faststart",
+    "-bitexact",
+]
 
 
 class DrawingError(ResphysError):
@@ -49,7 +61,10 @@ class DrawingError(ResphysError):
 
 
 class Renderer:
-    """A process that draws scenes one after the other, which the first scene starts; a context manager."""
+    """A process that draws scenes one after the other, which the first scene starts.
+
+    A context manager.
+    """
 
     def __init__(self) -> None:
         self._end: Callable[[], object] | None = None  # Ends the process, if there is one.
@@ -61,7 +76,10 @@ class Renderer:
         self.close()
 
     def close(self) -> None:
-        """Ends the process, as does garbage collection of the renderer; a further scene starts another."""
+        """Ends the process, as does garbage collection of the renderer.
+
+        A further scene starts another.
+        """
         if self._end is not None:
             self._end()
             self._end = None
@@ -71,7 +89,11 @@ class Renderer:
         if sys.platform == "linux":  # Skips the search for X and OSMesa.
             environment.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
         self._messages = TemporaryFile()  # noqa: SIM115
-        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": self._messages}
+        pipes: dict[str, Any] = {
+            "stdin": subprocess.PIPE,
+            "stdout": subprocess.PIPE,
+            "stderr": self._messages,
+        }
         try:
             self._process = subprocess.Popen(COMMAND, env=environment, **pipes)
         except OSError as error:
@@ -79,12 +101,14 @@ class Renderer:
         self._end = weakref.finalize(self, _end, self._process, self._messages)
 
     def frames(self, scene: RenderScene) -> Iterator[Pixels]:
-        """Yields frames (H, V * W, 3 | 4): red, green, blue and, without a background, opacity, from 0 to 255.
+        """Yields frames (H, V * W, 3 | 4): red, green, blue and,
+        without a background, opacity, from 0 to 255.
 
         All of them are to be taken before those of another scene.
 
         Raises:
-            DrawingError: There is no pyvista, no OpenGL driver that works off screen, or drawing takes too long.
+            DrawingError: There is no pyvista, no OpenGL driver that works off screen, or drawing
+                takes too long.
         """
         if self._end is None:
             self._start()
@@ -127,18 +151,22 @@ def _end(process: subprocess.Popen[bytes], messages: IO[bytes]) -> None:
 
 
 def draw(scene: RenderScene, renderer: Renderer | None = None) -> Pixels:
-    """Returns the frames (F, H, V * W, 3 | 4) of a scene, as from `Renderer.frames`, whose errors it raises.
+    """Returns the frames (F, H, V * W, 3 | 4) of a scene,
+    as from `Renderer.frames`, whose errors it raises.
 
     Args:
         scene: What is drawn.
-        renderer: Process that draws further scenes later, in place of a new one that ends with this scene.
+        renderer: Process that draws further scenes later, in place of a new one that ends with this
+            scene.
     """
     with Renderer() if renderer is None else nullcontext(renderer) as used:
         return np.stack(list(used.frames(scene)))
 
 
 def write_film(path: Path, scene: RenderScene, renderer: Renderer | None = None) -> None:
-    """Writes a film (MP4, H.264) of a scene with a background and a text for every frame; shows its progress.
+    """Writes a film (MP4, H.264) of a scene with a background and a text for every frame.
+
+    Shows its progress.
 
     Args:
         path: Of the file.
@@ -152,14 +180,20 @@ def write_film(path: Path, scene: RenderScene, renderer: Renderer | None = None)
     size = (scene.size[0] * len(scene.views), scene.size[1])
     options: dict[str, Any] = {"codec": "libx264", "quality": None, "ffmpeg_log_level": "error"}
     progress = Progress("video", len(scene.texts), "frames")
-    with atomic_path(path) as target, progress, Renderer() if renderer is None else nullcontext(renderer) as used:
+    with (
+        atomic_path(path) as target,
+        progress,
+        Renderer() if renderer is None else nullcontext(renderer) as used,
+    ):
         frames = used.frames(scene)
         first = next(frames)
         target.touch()  # Raises an error where the folder cannot be written.
         try:
             import imageio_ffmpeg
 
-            encoder = imageio_ffmpeg.write_frames(str(target), size, fps=scene.fps, output_params=_CODEC, **options)
+            encoder = imageio_ffmpeg.write_frames(
+                str(target), size, fps=scene.fps, output_params=_CODEC, **options
+            )
             encoder.send(None)
             for frame in chain([first], frames):
                 encoder.send(np.ascontiguousarray(frame))
@@ -168,15 +202,16 @@ def write_film(path: Path, scene: RenderScene, renderer: Renderer | None = None)
         except (ImportError, RuntimeError, OSError) as error:
             reason = str(error).strip().rpartition("\n")[2].rstrip(".")
             raise DrawingError(
-                f"the film cannot be encoded ({reason}): install the Python package imageio-ffmpeg, and make room for "
-                f"it in {path.parent}"
+                f"the film cannot be encoded ({reason}): install the Python package "
+                f"imageio-ffmpeg, and make room for it in {path.parent}"
             ) from error
 
 
 def _failure(reason: str) -> DrawingError:
     return DrawingError(
-        f"pyvista cannot draw the deformed body on this machine ({reason}): install the Python package pyvista and "
-        "an OpenGL driver that works without a display, such as libegl1 and libgl1-mesa-dri on Debian and Ubuntu"
+        f"pyvista cannot draw the deformed body on this machine ({reason}): install the Python "
+        "package pyvista and an OpenGL driver that works without a display, such as libegl1 and "
+        "libgl1-mesa-dri on Debian and Ubuntu"
     )
 
 
@@ -214,11 +249,17 @@ class _Drawer:
             if scene.sorts:
                 self._plotter.render_window.SetMultiSamples(0)  # Depth peeling needs whole pixels.
             else:
-                self._plotter.enable_anti_aliasing("msaa", multi_samples=_SAMPLES, all_renderers=True)
+                self._plotter.enable_anti_aliasing(
+                    "msaa", multi_samples=_SAMPLES, all_renderers=True
+                )
         self._plotter.clear()
         # Smooth edges of transparent pictures have a share of the background's colour.
         self._plotter.set_background(scene.background or OUTLINE, all_renderers=True)
-        light = {"light_type": "scene light", "position": TOWARDS_LIGHT, "focal_point": (0.0, 0.0, 0.0)}
+        light = {
+            "light_type": "scene light",
+            "position": TOWARDS_LIGHT,
+            "focal_point": (0.0, 0.0, 0.0),
+        }
         self._plotter.add_light(pyvista.Light(**light))
         return self._plotter
 
@@ -247,7 +288,9 @@ class _Drawer:
                 plotter.camera.parallel_scale = view.half_height
                 plotter.camera.clipping_range = (0.05 * distance, 2.0 * distance)
             plotter.render()
-            picture = plotter.screenshot(None, transparent_background=not scene.background, return_img=True)
+            picture = plotter.screenshot(
+                None, transparent_background=not scene.background, return_img=True
+            )
             if not scene.background and not picture[..., 3].any():
                 raise RuntimeError("the picture is empty")
             yield picture
@@ -267,10 +310,18 @@ class _DrawnLayer:
         self.around: FloatArray | None = None  # (Q, 3) of a ball or ring around its centre.
         cells = layer.cells
         if layer.kind in ("balls", "rings"):
-            self.around, corners = _ball(layer.size) if layer.kind == "balls" else _ring(layer.size, axes)
-            cells = np.concatenate([corners + len(self.around) * place for place in range(points.shape[1])])
+            self.around, corners = (
+                _ball(layer.size) if layer.kind == "balls" else _ring(layer.size, axes)
+            )
+            cells = np.concatenate(
+                [corners + len(self.around) * place for place in range(points.shape[1])]
+            )
         self.mesh = _mesh(layer, self._places(0), cells)
-        style = {"color": layer.colour, "opacity": layer.opacity, "smooth_shading": layer.kind == "balls"}
+        style = {
+            "color": layer.colour,
+            "opacity": layer.opacity,
+            "smooth_shading": layer.kind == "balls",
+        }
         style["lighting"] = layer.light is not None
         if layer.light is not None:
             style |= {"ambient": layer.light[0], "diffuse": layer.light[1]}
@@ -282,7 +333,10 @@ class _DrawnLayer:
             plotter.add_mesh(self.mesh, **style)
 
     def _places(self, frame: int) -> FloatArray:
-        """Positions (P Q, 3) of its points in a frame; points that are not finite are shrunk to zero size."""
+        """Positions (P Q, 3) of its points in a frame.
+
+        Points that are not finite are shrunk to zero size.
+        """
         points = _at(self.points, frame)
         whole = np.isfinite(points).all(axis=1, keepdims=True)
         if self.around is None:
@@ -303,11 +357,17 @@ def _mesh(layer: Layer, points: FloatArray, cells: Any) -> Any:
     if layer.kind.startswith("slice"):
         assert layer.plane is not None
         solid = pyvista.CellType.HEXAHEDRON if cells.shape[1] == 8 else pyvista.CellType.TETRA
-        return pyvista.UnstructuredGrid({solid: cells}, points).slice(normal=layer.plane[0], origin=layer.plane[1])
+        return pyvista.UnstructuredGrid({solid: cells}, points).slice(
+            normal=layer.plane[0], origin=layer.plane[1]
+        )
     if cells.shape[1] == 2:  # VTK expects the number of points before each line.
         return pyvista.PolyData(points, lines=np.insert(cells, 0, 2, axis=1).ravel())
     surface = pyvista.PolyData.from_regular_faces(points, cells)
-    return surface if layer.plane is None else surface.clip(normal=layer.plane[0], origin=layer.plane[1])
+    return (
+        surface
+        if layer.plane is None
+        else surface.clip(normal=layer.plane[0], origin=layer.plane[1])
+    )
 
 
 def _ball(radius: float) -> tuple[FloatArray, Any]:
@@ -322,11 +382,15 @@ def _ring(radius: float, axes: FloatArray) -> tuple[FloatArray, Any]:
     """Corners (Q, 3) and lines (Q, 2) of a ring that faces the viewer."""
     angle = 2.0 * np.pi * np.arange(_CORNERS)[:, None] / _CORNERS
     count = np.arange(_CORNERS)
-    return radius * (np.cos(angle) * axes[0] + np.sin(angle) * axes[1]), np.stack([count, np.roll(count, -1)], axis=1)
+    return radius * (np.cos(angle) * axes[0] + np.sin(angle) * axes[1]), np.stack(
+        [count, np.roll(count, -1)], axis=1
+    )
 
 
 def _add_texts(plotter: Any, scene: RenderScene) -> Any:
-    """Adds time and legends at the top, where controls of players do not hide them, and returns the time."""
+    """Adds time and legends at the top, where controls
+    of players do not hide them, and returns the time.
+    """
     top = scene.size[1] - 36
     for column, view in enumerate(scene.views):
         plotter.subplot(0, column)

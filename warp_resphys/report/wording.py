@@ -1,4 +1,6 @@
-"""Names and colours of the models and controllers that are compared, and formats of numbers and lists in sentences."""
+"""Names and colours of the models and controllers that are compared,
+and formats of numbers and lists in sentences.
+"""
 
 import math
 import re
@@ -38,7 +40,9 @@ class Tone(NamedTuple):
 MODELS: Final[Mapping[str, ComparedModel]] = {
     "rest": ComparedModel("At rest", "without physics: nothing moves", "a body that does not move"),
     "interpolation": ComparedModel(
-        "Interpolation", "without physics: straight lines between the training trials", "interpolation"
+        "Interpolation",
+        "without physics: straight lines between the training trials",
+        "interpolation",
     ),
     "regression": ComparedModel(
         "Regression", "without physics: ridge regression over the training trials", "regression"
@@ -48,20 +52,28 @@ MODELS: Final[Mapping[str, ComparedModel]] = {
         "without physics: linear from frame to frame, with powers of the inputs (DMDc)",
         "a linear model",
     ),
-    "published": ComparedModel("Published setting", "the simulator as the published code sets it up"),
+    "published": ComparedModel(
+        "Published setting", "the simulator as the published code sets it up"
+    ),
     "simulation": ComparedModel(
         "Uncorrected simulator", "with the values of the data sheet", "the uncorrected simulator"
     ),
-    "reconstruction": ComparedModel("Reconstruction", "the simulator with forces fitted to the test trial itself"),
+    "reconstruction": ComparedModel(
+        "Reconstruction", "the simulator with forces fitted to the test trial itself"
+    ),
     "sysid_elastic": ComparedModel(
         "SysID of E and ν",  # noqa: RUF001
         "the elastic parameters that fit best",
         "identification of E and \N{GREEK SMALL LETTER NU}",
     ),
     "sysid": ComparedModel("SysID", "the simulator with the parameters that fit best"),
-    "law": ComparedModel("Law", "the simulator with the identified law of its material", "the law of the material"),
+    "law": ComparedModel(
+        "Law", "the simulator with the identified law of its material", "the law of the material"
+    ),
     "actuator": ComparedModel(
-        "Actuator", "the simulator under learned inputs, which differ from the commands", "the learned actuator"
+        "Actuator",
+        "the simulator under learned inputs, which differ from the commands",
+        "the learned actuator",
     ),
     "simfree": ComparedModel("SimFree", "a network in place of the simulator"),
     "resphys_uncorrected": ComparedModel(
@@ -69,7 +81,9 @@ MODELS: Final[Mapping[str, ComparedModel]] = {
         "the learned force on the uncorrected simulator",
         "the learned force on the uncorrected simulator",
     ),
-    "resphys": ComparedModel("ResPhys", "the simulator with the learned force, which sees only the simulated state"),
+    "resphys": ComparedModel(
+        "ResPhys", "the simulator with the learned force, which sees only the simulated state"
+    ),
 }
 # matplotlib draws the light tones, and `figures.themed_svg` replaces them, so they must differ.
 TONES: Final[Mapping[str, Tone]] = {
@@ -95,9 +109,18 @@ TONES: Final[Mapping[str, Tone]] = {
 # By prefix of a controller: name in words, and description.
 _CONTROLLERS: Final[Mapping[str, tuple[str, str]]] = {
     "open_": ("{}, open loop", "planned once for the whole path, and played"),
-    "receding_linear": ("Linear model, receding horizon", "dynamic mode decomposition of the same recordings"),
-    "receding_": ("{}, receding horizon", "planned anew at each step, from an estimate by the markers"),
-    "feedback_": ("Jacobian feedback, {}/s", "with the measured Jacobian of the point by the inputs"),
+    "receding_linear": (
+        "Linear model, receding horizon",
+        "dynamic mode decomposition of the same recordings",
+    ),
+    "receding_": (
+        "{}, receding horizon",
+        "planned anew at each step, from an estimate by the markers",
+    ),
+    "feedback_": (
+        "Jacobian feedback, {}/s",
+        "with the measured Jacobian of the point by the inputs",
+    ),
 }
 
 
@@ -107,7 +130,9 @@ def model_words(model: str) -> str:
 
 
 def shown_models(positions: Collection[str], recommended: str = "") -> list[str]:
-    """Returns the models that are drawn as bodies: the uncorrected one, then the recommended or most corrected one."""
+    """Returns the models that are drawn as bodies: the uncorrected one,
+    then the recommended or most corrected one.
+    """
     plain = ("simulation", "published")
     corrected = ("resphys", "resphys_uncorrected", "actuator", "law", "sysid", "sysid_elastic")
     groups = (plain, corrected if recommended in plain else (recommended, *corrected))
@@ -115,9 +140,13 @@ def shown_models(positions: Collection[str], recommended: str = "") -> list[str]
 
 
 def models_in_figures(errors: Mapping[str, ErrorSummary]) -> list[str]:
-    """Returns the models that figures show: of those without physics only the one of least mean error."""
+    """Returns the models that figures show: of those
+    without physics only the one of least mean error.
+    """
     plain = [model for model in BASELINES if model in errors]
-    best = min(plain, key=lambda model: np.inf if (e := errors[model]["mean"]) is None else e, default="")
+    best = min(
+        plain, key=lambda model: np.inf if (e := errors[model]["mean"]) is None else e, default=""
+    )
     return [model for model in MODELS if model in errors and (model not in plain or model == best)]
 
 
@@ -137,11 +166,17 @@ def controller_name(controller: str) -> str:
 def compared_controllers(control: ControlSettings) -> list[str]:
     """Returns the names of the controllers that are drawn."""
     models = [model for model in control.models if model in ("sysid", "law", control.models[-1])]
-    return [*(f"open_{model}" for model in models), *(f"receding_{model}" for model in control.receding[-1:])]
+    return [
+        *(f"open_{model}" for model in models),
+        *(f"receding_{model}" for model in control.receding[-1:]),
+    ]
 
 
 def number_text(value: float | None) -> str:
-    """Returns a number with three digits, such as "1.07" or "0.0384", or "below 0.001"; None: diverged."""
+    """Returns a number with three digits, such as "1.07" or "0.0384", or "below 0.001".
+
+    None: diverged.
+    """
     if value is None:
         return "diverged"
     return f"below {_LEAST:g}" if 0.0 < abs(value) < _LEAST else f"{value:,.{_decimals(value)}f}"
@@ -157,9 +192,16 @@ def mm_text(value: float | None) -> str:
 
 
 def largest_text(errors: NDArray[np.float64]) -> str:
-    """Returns the largest of errors [mm] as text; NaN is left out, an infinite error has diverged."""
+    """Returns the largest of errors [mm] as text.
+
+    NaN is left out, an infinite error has diverged.
+    """
     values = errors[~np.isnan(errors)]
-    return mm_text(float(values.max())) if len(values) and np.isfinite(values).all() else "infinity (it diverged)"
+    return (
+        mm_text(float(values.max()))
+        if len(values) and np.isfinite(values).all()
+        else "infinity (it diverged)"
+    )
 
 
 def error_parts(summary: ErrorSummary) -> tuple[str, str]:
@@ -203,7 +245,9 @@ def significant(value: float, digits: int = 2) -> str:
 
 
 def share_text(share: float) -> str:
-    """Returns a share as a percentage, such as "63 %", "99.8 %" or "more than 99.9 %", with a digit of the rest."""
+    """Returns a share as a percentage, such as "63 %",
+    "99.8 %" or "more than 99.9 %", with a digit of the rest.
+    """
     if _CLEAREST < share < 1.0:
         return f"more than {100.0 * _CLEAREST:g} %"
     left = 100.0 * (1.0 - share)
@@ -213,7 +257,9 @@ def share_text(share: float) -> str:
 
 def unbroken(text: str) -> str:
     """Returns a text with no-break spaces between numbers and their units or symbols."""
-    return re.sub(r"(?<=\d) (?=(?:mm|kPa|s)\b|%)|(?<=\b[Eν]) (?=\d)", NO_BREAK_SPACE, text)  # noqa: RUF001
+    units = r"(?<=\d) (?=(?:mm|kPa|s)\b|%)"
+    symbols = r"(?<=\b[Eν]) (?=\d)"  # noqa: RUF001
+    return re.sub(f"{units}|{symbols}", NO_BREAK_SPACE, text)
 
 
 def in_a_row(words: Sequence[str]) -> str:

@@ -1,4 +1,6 @@
-"""Inputs of a robot by name: checked values, and their effects on its simulator, its network and later steps."""
+"""Inputs of a robot by name: checked values, and their effects on its simulator,
+its network and later steps.
+"""
 
 import math
 from collections.abc import Mapping
@@ -64,7 +66,9 @@ class RobotInput:
 
     @property
     def is_taken(self) -> bool:
-        """Whether an energy of the body takes it: the command of an actuator, or the motion of an obstacle."""
+        """Whether an energy of the body takes it: the command of an actuator,
+        or the motion of an obstacle.
+        """
         return self.quantity not in (_UNLIMITED, PAYLOAD)
 
 
@@ -74,9 +78,13 @@ def inputs_of(simulator: Simulator, description: Description) -> dict[str, Robot
     for energy in [energy for energy in simulator.body.energies if isinstance(energy, Energy)]:
         for quantity in energy.inputs:
             low, high = description.seen.get(quantity.name, (None, None))
-            inputs[quantity.name] = RobotInput(quantity.name, quantity.unit, energy.names, low, high, quantity)
+            inputs[quantity.name] = RobotInput(
+                quantity.name, quantity.unit, energy.names, low, high, quantity
+            )
     if description.payload_at is not None:
-        inputs[PAYLOAD.name] = RobotInput(PAYLOAD.name, PAYLOAD.unit, ("payload",), quantity=PAYLOAD)
+        inputs[PAYLOAD.name] = RobotInput(
+            PAYLOAD.name, PAYLOAD.unit, ("payload",), quantity=PAYLOAD
+        )
     if len(simulator.fixed):
         inputs[BASE] = RobotInput(BASE, "m, rad", _POSE)
     return inputs
@@ -102,7 +110,9 @@ class InputReader:
         if name == FORCE:
             return self.field(value, FORCE).expand(batch, -1, -1)
         if name not in self._inputs:
-            raise InputError(f"there is no input {name!r}: the robot has {listed([*self._inputs, FORCE])}.")
+            raise InputError(
+                f"there is no input {name!r}: the robot has {listed([*self._inputs, FORCE])}."
+            )
         declared = self._inputs[name]
         parts = declared.parts
         if isinstance(value, Mapping):
@@ -111,12 +121,17 @@ class InputReader:
                 raise InputError(f"{name} has no part {unknown[0]!r}: it has {listed(parts)}.")
             value = [float(value.get(part, 0.0)) for part in parts]
         values = self._tensor(value, name)
-        values = values[..., None] if len(parts) == 1 and (values.ndim == 0 or values.shape[-1] != 1) else values
+        values = (
+            values[..., None]
+            if len(parts) == 1 and (values.ndim == 0 or values.shape[-1] != 1)
+            else values
+        )
         values = values[None] if values.ndim == 1 else values
         if values.ndim != 2 or values.shape[1] != len(parts) or len(values) not in (1, batch):
             raise InputError(
-                f"{name} has shape {tuple(values.shape)}: give ({len(parts)},) values in {declared.unit}, one for each "
-                f"of {listed(parts)}, or ({batch}, {len(parts)}) for the {batch} environments."
+                f"{name} has shape {tuple(values.shape)}: give ({len(parts)},) values in "
+                f"{declared.unit}, one for each of {listed(parts)}, or ({batch}, {len(parts)}) "
+                f"for the {batch} environments."
             )
         if math.isfinite(declared.quantity.lower) or math.isfinite(declared.quantity.upper):
             declared.quantity.check(values)
@@ -131,13 +146,20 @@ class InputReader:
         return self._tensor(value, name).ndim >= (3 if name == FORCE else 2)
 
     def series(self, name: str, value: Given, batch: int) -> torch.Tensor:
-        """Returns the values (1, B, C) of a constant input or (T, B, C) of a series; raises the errors of `read`."""
+        """Returns the values (1, B, C) of a constant input or (T, B, C) of a series.
+
+        Raises the errors of `read`.
+        """
         if isinstance(value, Mapping) or not self.is_series(name, value):
             return self.read(name, value, batch)[None]
         return torch.stack([self.read(name, now, batch) for now in self._tensor(value, name)])
 
-    def by_step(self, inputs: Mapping[str, Given], steps: int | None, batch: int) -> list[dict[str, torch.Tensor]]:
-        """Returns the values of constant inputs and series in every step; the last ones of a shorter series stay.
+    def by_step(
+        self, inputs: Mapping[str, Given], steps: int | None, batch: int
+    ) -> list[dict[str, torch.Tensor]]:
+        """Returns the values of constant inputs and series in every step.
+
+        The last ones of a shorter series stay.
 
         Args:
             inputs: by name.
@@ -148,11 +170,19 @@ class InputReader:
             InputError: as `read`, or no number of steps.
         """
         series = {name: self.series(name, value, batch) for name, value in inputs.items()}
-        lengths = [len(series[name]) for name, value in inputs.items() if self.is_series(name, value)]
+        lengths = [
+            len(series[name]) for name, value in inputs.items() if self.is_series(name, value)
+        ]
         if steps is None and not lengths:
-            raise InputError("the number of steps is unknown: give `steps`, or an input with a value for each step.")
+            raise InputError(
+                "the number of steps is unknown: give `steps`, "
+                "or an input with a value for each step."
+            )
         count = max(lengths, default=0) if steps is None else steps
-        return [{name: value[min(k, len(value) - 1)] for name, value in series.items()} for k in range(count)]
+        return [
+            {name: value[min(k, len(value) - 1)] for name, value in series.items()}
+            for k in range(count)
+        ]
 
     def field(self, values: Any, name: str) -> torch.Tensor:
         """Returns vectors of the vertices (B, N, 3), given as (N, 3) or (B, N, 3).
@@ -164,14 +194,19 @@ class InputReader:
         field = field[None] if field.ndim == 2 else field
         wanted = (self._simulator.body.n_vertices, 3)
         if field.ndim != 3 or tuple(field.shape[1:]) != wanted:
-            raise InputError(f"{name} has shape {tuple(field.shape)}: give {wanted}, or one such array an environment.")
+            raise InputError(
+                f"{name} has shape {tuple(field.shape)}: give {wanted}, "
+                "or one such array an environment."
+            )
         return field
 
     def _tensor(self, value: Any, name: str) -> torch.Tensor:
         try:
             return self._simulator.tensor(value)
         except InputError:
-            raise InputError(f"{name} is {value!r}: give numbers, or an array or a tensor of numbers.") from None
+            raise InputError(
+                f"{name} is {value!r}: give numbers, or an array or a tensor of numbers."
+            ) from None
 
 
 @dataclass(frozen=True)
@@ -179,11 +214,12 @@ class Acting:
     """Inputs that act during a step of B environments."""
 
     inputs: Inputs  # of the simulator
-    conditions: torch.Tensor | None  # (B, A) inputs of the network beside the state; None if it has none
-    # memory variables of the robot's actuators and base after the step (`State.memory_of`), such as ``pressure.queue``
-    # (B, K, C), see `InputResponse`, and ``base`` (B, 2, 6) [m, rad]
+    conditions: torch.Tensor | None  # (B, A) what the network takes beside the state, if any
+    # memory variables of the robot's actuators and base after the step (`State.memory_of`), such as
+    # ``pressure.queue`` (B, K, C), see `InputResponse`, and ``base`` (B, 2, 6) [m, rad]
     memory: dict[str, torch.Tensor]
-    # (3, B, 6) displacement of the base from one step ago until after the step; None if it never moved
+    # (3, B, 6) displacement of the base from one step ago until after the step; None if it never
+    # moved
     base: torch.Tensor | None
 
     def remembered(self, state: State, predictor: LearnedPredictor | None, after: State) -> State:
@@ -194,17 +230,29 @@ class Acting:
         return after.with_memory(memory)
 
 
-def values_of_material(simulator: Simulator, parameters: Mapping[str, torch.Tensor]) -> dict[str, float]:
+def values_of_material(
+    simulator: Simulator, parameters: Mapping[str, torch.Tensor]
+) -> dict[str, float]:
     """Returns those of a robot's parameters that are its material's, without damping by mass."""
     materials = simulator.materials.items()
-    material = {f"{region}_{name}" if region else name for region, used in materials for name in used.parameters}
-    return {name: float(parameters[name][0]) for name in material & parameters.keys() - {MASS_DAMPING}}
+    material = {
+        f"{region}_{name}" if region else name
+        for region, used in materials
+        for name in used.parameters
+    }
+    return {
+        name: float(parameters[name][0]) for name in material & parameters.keys() - {MASS_DAMPING}
+    }
 
 
 def moved_actuators(
-    description: Description, parameters: Mapping[str, torch.Tensor], here: Simulator, there: Simulator
+    description: Description,
+    parameters: Mapping[str, torch.Tensor],
+    here: Simulator,
+    there: Simulator,
 ) -> tuple[dict[str, float], dict[str, InputNetwork]]:
-    """Returns the parameters of inputs, and the networks that change them, for inputs whose parts two bodies share.
+    """Returns the parameters of inputs, and the networks that change them,
+    for inputs whose parts two bodies share.
 
     Args:
         description: of the robot.
@@ -213,8 +261,12 @@ def moved_actuators(
         there: that of the other body.
     """
     same = {name for name, parts in here.parts.items() if there.parts.get(name) == parts}
-    response = {name: float(x[0]) for name, x in parameters.items() if command_of(here, name)[0] in same}
-    return response, {name: network for name, network in description.actuator.items() if name in same}
+    response = {
+        name: float(x[0]) for name, x in parameters.items() if command_of(here, name)[0] in same
+    }
+    return response, {
+        name: network for name, network in description.actuator.items() if name in same
+    }
 
 
 class Commands:
@@ -236,16 +288,22 @@ class Commands:
     ) -> None:
         self._simulator, self._description, self._inputs = simulator, description, inputs
         self._mass_factor = parameters.get(MASS_FACTOR)
-        h, filters = simulator.time_step, description.filters if description.learned is not None else ()
+        h = simulator.time_step
+        filters = description.filters if description.learned is not None else ()
         taken = [name for name, declared in inputs.items() if declared.is_taken]
         parts, actuator = simulator.parts, description.actuator
         responses = {
-            name: response_of(simulator.inputs[name], parameters, parts.get(name, ()), actuator) for name in taken
+            name: response_of(simulator.inputs[name], parameters, parts.get(name, ()), actuator)
+            for name in taken
         }
-        self._responses = {name: InputResponse(h, **values, filters=filters) for name, values in responses.items()}
+        self._responses = {
+            name: InputResponse(h, **values, filters=filters) for name, values in responses.items()
+        }
 
     def begin(self, body: State, inputs: Mapping[str, torch.Tensor]) -> State:
-        """Returns the state after constant inputs (B, C), zero if omitted, have acted for a long time."""
+        """Returns the state after constant inputs (B, C),
+        zero if omitted, have acted for a long time.
+        """
         memory = {"lost": body.lost, "left": body.left}
         for name, response in self._responses.items():
             still = response.steady(self._value(name, inputs, body))
@@ -255,15 +313,22 @@ class Commands:
         return body.with_memory(memory)
 
     def act(self, state: State, inputs: Mapping[str, torch.Tensor]) -> Acting:
-        """Returns what acts during a step with inputs (B, C) by name; omitted ones are zero, an omitted base stays."""
+        """Returns what acts during a step with inputs (B, C) by name.
+
+        Omitted ones are zero, an omitted base stays.
+        """
         description = self._description
         fields: dict[str, torch.Tensor | None] = {FORCE: inputs.get(FORCE)}
-        conditions, memory, before = list[torch.Tensor](), dict[str, torch.Tensor](), state.memory_of()
+        conditions = list[torch.Tensor]()
+        memory = dict[str, torch.Tensor]()
+        before = state.memory_of()
         payload = inputs.get(PAYLOAD.name)
         if description.payload_at is not None and description.sees_payload:
             conditions.append(self._value(PAYLOAD.name, inputs, state))
         for name, response in self._responses.items():
-            remembered = {key: x.movedim(0, -2) for key, x in state.memory_of(f"{ROBOT}.{name}").items()}
+            remembered = {
+                key: x.movedim(0, -2) for key, x in state.memory_of(f"{ROBOT}.{name}").items()
+            }
             acting, means, later = response(remembered, self._value(name, inputs, state)[None])
             fields[name] = acting[0]
             conditions += [with_means(acting[0], means[:, 0])] if name in description.seen else []
@@ -272,7 +337,9 @@ class Commands:
             fields |= self._hung(payload)
         base = None
         if BASE in inputs or BASE in before:
-            moved = before[BASE].unbind(1) if BASE in before else [torch.zeros_like(inputs[BASE])] * 2
+            moved = (
+                before[BASE].unbind(1) if BASE in before else [torch.zeros_like(inputs[BASE])] * 2
+            )
             base = torch.stack([*moved, inputs.get(BASE, moved[1])])
             memory[BASE] = base[1:].movedim(1, 0)
             fields["fixed_positions"] = self._fixed(base[2])
@@ -281,18 +348,26 @@ class Commands:
             if description.told_of_base is not None:
                 gravity = self._simulator.tensor(self._simulator.gravity)
                 movement = base_movement(base, self._simulator.time_step, gravity)[1]
-                conditions.append(movement[:, torch.tensor(description.told_of_base, device=movement.device)])
-        return Acting(Inputs(**fields), torch.cat(conditions, -1) if conditions else None, memory, base)
+                conditions.append(
+                    movement[:, torch.tensor(description.told_of_base, device=movement.device)]
+                )
+        return Acting(
+            Inputs(**fields), torch.cat(conditions, -1) if conditions else None, memory, base
+        )
 
     def _value(self, name: str, inputs: Mapping[str, torch.Tensor], body: State) -> torch.Tensor:
         """Returns the values (B, C) of an input, zero if omitted."""
         value = inputs.get(name)
-        return body.q.new_zeros(body.batch, len(self._inputs[name].parts)) if value is None else value
+        return (
+            body.q.new_zeros(body.batch, len(self._inputs[name].parts)) if value is None else value
+        )
 
     @cached_property
     def _payload_share(self) -> torch.Tensor:
         """Share (1, N) of a payload that hangs on each vertex."""
-        share = payload_inputs(self._simulator.body, self._description.payload_at, np.ones(1))["attached_mass"]
+        share = payload_inputs(self._simulator.body, self._description.payload_at, np.ones(1))[
+            "attached_mass"
+        ]
         return self._simulator.tensor(share)
 
     def _hung(self, payload: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -301,16 +376,18 @@ class Commands:
         return {"attached_mass": mass * self._payload_share}
 
     def _check_base(self, base: torch.Tensor) -> None:
-        """Refuses poses (3, B, 6) of the base of which the last step moves fixed vertices too far."""
+        """Refuses poses (3, B, 6) of the base of which the last step moves fixed vertices too
+        far.
+        """
         moved = (self._fixed(base[2]) - self._fixed(base[1])).detach().norm(dim=2)
         rest = self._simulator.rest_positions
         furthest, size = float(moved.max()), float((rest.amax(0) - rest.amin(0)).max())
         milliseconds = 1e3 * self._simulator.time_step
         if furthest > LARGEST_STEP * size:
             raise InputError(
-                f"base moves by {1e3 * furthest:.4g} mm in a step of {milliseconds:g} ms, and a body "
-                f"of {1e3 * size:.4g} mm follows up to {1e3 * LARGEST_STEP * size:.4g} mm: give poses in m and rad, or "
-                "move it in smaller steps."
+                f"base moves by {1e3 * furthest:.4g} mm in a step of {milliseconds:g} ms, and a "
+                f"body of {1e3 * size:.4g} mm follows up to {1e3 * LARGEST_STEP * size:.4g} mm: "
+                "give poses in m and rad, or move it in smaller steps."
             )
 
     def _fixed(self, pose: torch.Tensor) -> torch.Tensor:
@@ -319,7 +396,9 @@ class Commands:
         return rest @ rotations(pose[:, 3:]).mT + pose[:, None, :3]
 
 
-def since_change(time_step: float, driven: Mapping[str, torch.Tensor], times: int, batch: int) -> FloatArray:
+def since_change(
+    time_step: float, driven: Mapping[str, torch.Tensor], times: int, batch: int
+) -> FloatArray:
     """Returns (T + 1, B) times since the last change of commands (T, B, ...) at T + 1 times [s]."""
     values = [commands.detach().cpu().double().numpy() for commands in driven.values()]
     acting = [np.concatenate([series, series[-1:]]).reshape(times, batch, -1) for series in values]

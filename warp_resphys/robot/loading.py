@@ -24,35 +24,44 @@ from .robot import Robot
 
 
 @checks_types
-def load(path: str | Path, model: str | None = None, device: str = "cpu", on_failure: str = "raise") -> Robot:
+def load(
+    path: str | Path, model: str | None = None, device: str = "cpu", on_failure: str = "raise"
+) -> Robot:
     """Loads the robot of a finished run, or of a file that `Robot.save` wrote.
 
     Args:
-        path: of the run folder, such as ``runs/sopra/default``, of one of its folds, or of the file.
-        model: ``resphys``, the identified simulator with its learned force; ``actuator``, with its learned actuator
-            alone; ``sysid``, the identified simulator; ``simulation``, the uncorrected one; ``simfree``, a network
-            alone. None: the one that the report of the run recommends. A file contains one model.
+        path: of the run folder, such as ``runs/sopra/default``, of one of its folds, or of the
+            file.
+        model: ``resphys``, the identified simulator with its learned force; ``actuator``, with its
+            learned actuator alone; ``sysid``, the identified simulator; ``simulation``, the
+            uncorrected one; ``simfree``, a network alone. None: the one that the report of the run
+            recommends. A file contains one model.
         device: of the simulation: ``cpu``, ``cuda`` or ``auto``.
         on_failure: ``raise``, or ``count``, see `Robot`.
 
     Raises:
-        DataFileError: there is no such run, it has not identified or trained the model, it is of another version, or
-            a file of it has changed.
+        DataFileError: there is no such run, it has not identified or trained the model, it is of
+            another version, or a file of it has changed.
         InputError: the experiment has no such model, or the device is unknown.
     """
     place = Path(path).expanduser()
     where = choose_device(device)
     if place.is_file():
         if place.suffix != SUFFIX:
-            raise DataFileError(f"{place} is no robot: name a run folder, or a {SUFFIX} file of `Robot.save`.")
+            raise DataFileError(
+                f"{place} is no robot: name a run folder, or a {SUFFIX} file of `Robot.save`."
+            )
         description = Description.read(place)
         if model not in (None, description.model):
             raise InputError(
-                f"the model is {model!r}, but {place} contains {description.model!r}: load that, or the run folder."
+                f"the model is {model!r}, but {place} contains {description.model!r}: load that, "
+                "or the run folder."
             )
         return Robot(description, where, on_failure)
     if not place.is_dir():
-        raise DataFileError(f"{place} does not exist: name a run folder, or a file that `Robot.save` wrote.")
+        raise DataFileError(
+            f"{place} does not exist: name a run folder, or a file that `Robot.save` wrote."
+        )
     return Robot(describe(place, model), where, on_failure, folder=place)
 
 
@@ -88,22 +97,28 @@ class RecordedTrial:
         return np.asarray(markers if self.shift is None else markers + self.shift)
 
     def errors_mm(self, motion: Motion) -> NDArray[np.float64]:
-        """Returns the distances of a motion's markers from the observed ones [mm], as the report counts them.
+        """Returns the distances of a motion's markers from the observed ones [mm],
+        as the report counts them.
 
         Returns:
-            (F, K) for K markers and rigid bodies, each of these at its position; NaN where one was not seen.
+            (F, K) for K markers and rigid bodies, each of these at its position; NaN where one was
+            not seen.
         """
         away = as_markers(self.shown(motion) - self.markers, motion.labels)
         return np.asarray(1e3 * np.linalg.norm(away, axis=-1))
 
 
 def trial_names(robot: Robot) -> tuple[str, ...]:
-    """Returns the names of the trials of a robot's run, first those of the test, which no model was trained on.
+    """Returns the names of the trials of a robot's run,
+    first those of the test, which no model was trained on.
 
     Raises:
         InputError: the robot was loaded from a file.
     """
-    return (*(first := held_out_names(robot)), *(name for name in _experiment(robot).trials.names if name not in first))
+    return (
+        *(first := held_out_names(robot)),
+        *(name for name in _experiment(robot).trials.names if name not in first),
+    )
 
 
 def held_out_names(robot: Robot, moving: bool = False) -> tuple[str, ...]:
@@ -138,7 +153,10 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
         replay = experiment.motions.replay(simulator, [name], identified)
         start = experiment.motions.start(replay, identified)
         constants, _, resting = replay.prepare(identified.values(simulator))
-        inputs = {key: value.to(simulator.rest_positions) for key, value in replay.trials.inputs.actuation.items()}
+        inputs = {
+            key: value.to(simulator.rest_positions)
+            for key, value in replay.trials.inputs.actuation.items()
+        }
         inputs = _commands(experiment, robot, name, inputs)
         load = float(experiment.trials.payload[experiment.trials.rows([name])[0]])
         if load:
@@ -156,7 +174,9 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
             if base is not None:
                 poses = base.to(simulator.rest_positions)
                 inputs[BASE] = poses[1:]
-                begun = begun.with_memory({**begun.memory_of(), BASE: poses[0][:, None].repeat(1, 2, 1)})
+                begun = begun.with_memory(
+                    {**begun.memory_of(), BASE: poses[0][:, None].repeat(1, 2, 1)}
+                )
     trials = replay.trials
     since = (trials.times - start.delay[:, None]).clamp_min(0.0)[0].cpu().numpy()
     shift = None if start.shift is None else start.shift[0].cpu().numpy()
@@ -166,21 +186,33 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
 def _commands(
     experiment: Experiment, robot: Robot, name: str, inputs: Mapping[str, torch.Tensor]
 ) -> dict[str, torch.Tensor]:
-    """Commands under which the robot does what it did under those of a trial with a zero or factor of its own."""
+    """Commands under which the robot does what it did
+    under those of a trial with a zero or factor of its own.
+    """
     values, commands = experiment.parameters(robot.description.model), dict(inputs)
     of_trial = dict(values)
     for owner in (experiment.trials.session(name), name):
-        of_trial |= {split_name(full)[0]: value for full, value in values.items() if split_name(full)[1] == owner}
+        of_trial |= {
+            split_name(full)[0]: value
+            for full, value in values.items()
+            if split_name(full)[1] == owner
+        }
     for key, series in inputs.items():
         quantity, parts = robot.simulator.inputs[key], robot.simulator.parts.get(key, ())
         here, there = (response_of(quantity, known, parts) for known in (of_trial, values))
         same = [word for word in here if here[word] is there.get(word)]
         if "zero" in here and "zero" not in same:
-            commands[key] = (series - _column(here["zero"]) + _column(there["zero"])).clamp_min(quantity.lower)
+            commands[key] = (series - _column(here["zero"]) + _column(there["zero"])).clamp_min(
+                quantity.lower
+            )
         if "factor" in here and "factor" not in same:
-            beyond = commands[key] - sum(_column(there[word]) for word in ("zero", "dead_band") if word in there)
+            beyond = commands[key] - sum(
+                _column(there[word]) for word in ("zero", "dead_band") if word in there
+            )
             beyond = beyond.clamp_min(0.0) if "dead_band" in there else beyond
-            commands[key] = commands[key] + beyond * (_column(here["factor"]) / _column(there["factor"]) - 1.0)
+            commands[key] = commands[key] + beyond * (
+                _column(here["factor"]) / _column(there["factor"]) - 1.0
+            )
     return commands
 
 
@@ -191,5 +223,7 @@ def _column(values: torch.Tensor) -> torch.Tensor:
 
 def _experiment(robot: Robot) -> Experiment:
     if robot.folder is None:
-        raise InputError("the robot was loaded from a file, which has no trials: load its run folder instead.")
+        raise InputError(
+            "the robot was loaded from a file, which has no trials: load its run folder instead."
+        )
     return finished_experiment(robot.folder, robot.description.model)

@@ -1,4 +1,6 @@
-"""Describes a robot that is made of a simulator of Python, with markers, parameters and ranges of its inputs."""
+"""Describes a robot that is made of a simulator of Python,
+with markers, parameters and ranges of its inputs.
+"""
 
 from collections.abc import Mapping
 
@@ -27,12 +29,17 @@ def description_of(
         InputError: see `Robot.of`.
     """
     if isinstance(simulator.body, Scene):
-        raise InputError("the simulator is of a scene: give a Simulator of one body; RobotScene joins several robots.")
+        raise InputError(
+            "the simulator is of a scene: give a Simulator of one body; "
+            "RobotScene joins several robots."
+        )
     known, mesh = Identified.of(parameters), simulator.body.mesh
     if isinstance(markers, Mapping):
         markers = bind_markers(mesh, np.array([*markers.values()], dtype=np.float64), [*markers])
     if markers is not None and not markers.labels:
-        raise InputError(f"markers is {in_short(markers)} without labels: give places by label, or bind_markers.")
+        raise InputError(
+            f"markers is {in_short(markers)} without labels: give places by label, or bind_markers."
+        )
     return Description(
         name=name,
         model="sysid" if known.parameters else "simulation",
@@ -53,9 +60,11 @@ def description_of(
 def _range_of(
     simulator: Simulator, name: str, limits: tuple[ArrayLike, ArrayLike]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Returns the least and the greatest value of each part of an input, given as numbers or by part."""
+    """The least and the greatest value of each part of an input, given as numbers or by part."""
     if name not in simulator.inputs:
-        raise InputError(f"ranges has no input of the body in {name!r}: it has {listed([*simulator.inputs])}.")
+        raise InputError(
+            f"ranges has no input of the body in {name!r}: it has {listed([*simulator.inputs])}."
+        )
     count = simulator.counts[name]
     try:
         low, high = (np.broadcast_to(np.asarray(end, dtype=np.float64), (count,)) for end in limits)
@@ -64,7 +73,7 @@ def _range_of(
     if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
         unit = simulator.inputs[name].unit
         raise InputError(
-            f"ranges.{name} is {limits!r}: give the least and the greatest value in {unit or 'shares'}, numbers or one "
-            f"for each of its {count} parts."
+            f"ranges.{name} is {limits!r}: give the least and the greatest value in "
+            f"{unit or 'shares'}, numbers or one for each of its {count} parts."
         )
     return tuple(low.tolist()), tuple(high.tolist())

@@ -16,8 +16,19 @@ from ..dynamics.trajectory import Motion
 from ..io.errors import ConvergenceError, InputError, checks_methods, checks_types
 from ..learning.evaluation import POSE_STEPS
 from ..learning.observed_motions import Identified
-from ..learning.parameters import TILTS, check_names, constants_of, identifiable_parameters, replaced
-from ..learning.residuals.correction import DIVERGENCE_DISTANCE, CorrectedSimulator, LearnedPredictor, force_frames
+from ..learning.parameters import (
+    TILTS,
+    check_names,
+    constants_of,
+    identifiable_parameters,
+    replaced,
+)
+from ..learning.residuals.correction import (
+    DIVERGENCE_DISTANCE,
+    CorrectedSimulator,
+    LearnedPredictor,
+    force_frames,
+)
 from ..learning.residuals.feedback import equilibrium_under_feedback
 from ..learning.residuals.networks import NextState
 from ..mesh.volume_mesh import Mesh
@@ -43,14 +54,18 @@ from .of_simulator import description_of
 
 @checks_methods("__init__", "rollout", "begin", "settle", "step", "observe", "save")
 class Robot:
-    """The simulator of an experiment with identified parameters and learned force; `loading.load` makes one.
+    """The simulator of an experiment with identified parameters and learned force.
 
-    A robot is constant: `step` returns a new state. States, inputs and parameters are differentiable.
+    `loading.load` makes one.
+
+    A robot is constant: `step` returns a new state. States, inputs and parameters are
+    differentiable.
 
     Args:
         description: definition of the robot.
         device: of the simulation.
-        on_failure: ``raise``, or ``count``: environments that diverge stand at rest and are ``lost``.
+        on_failure: ``raise``, or ``count``: environments that diverge stand at rest and are
+            ``lost``.
         parameters: (1,) or (B,) values that replace the identified ones.
         folder: of its run, with the trials; None for a robot from a file.
 
@@ -98,17 +113,22 @@ class Robot:
         ranges: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
         name: str = "robot",
     ) -> "Robot":
-        """Returns the robot of a simulator of Python, which can do what one of a run can, but has no trials.
+        """Returns the robot of a simulator of Python,
+        which can do what one of a run can, but has no trials.
 
         Args:
             simulator: of one body.
-            markers: of `bind_markers`, or places (3,) on the body at rest by label [m]; None: vertices are observed.
-            parameters: values in place of the simulator's, by name or from `identify`, with their uncertainty.
-            ranges: least and greatest value by input, a number or one for each part; environments need them.
+            markers: of `bind_markers`, or places (3,) on the body at rest by label [m]; None:
+                vertices are observed.
+            parameters: values in place of the simulator's, by name or from `identify`, with their
+                uncertainty.
+            ranges: least and greatest value by input, a number or one for each part; environments
+                need them.
             name: in descriptions.
 
         Raises:
-            InputError: no simulator of one body, or markers, parameters or ranges that do not fit it.
+            InputError: no simulator of one body, or markers, parameters or ranges that do not fit
+                it.
         """
         made = description_of(simulator, markers, parameters, ranges or {}, name)
         return cls(made, simulator.device, simulator.settings.on_failure)
@@ -120,7 +140,9 @@ class Robot:
         count = max((len(value) for value in values.values()), default=1)
         for name, value in values.items():
             if len(value) not in (1, count):
-                raise InputError(f"{name} has {len(value)} values, others {count}: give 1 or {count}.")
+                raise InputError(
+                    f"{name} has {len(value)} values, others {count}: give 1 or {count}."
+                )
         self.parameters = values
         spread = {name: value.expand(count) for name, value in values.items()}
         self.constants = self.simulator.prepare(constants_of(self.simulator, spread))
@@ -130,7 +152,8 @@ class Robot:
         """Returns a robot with other parameters, which shares all other data with this one.
 
         Args:
-            parameters: by name, numbers or (B,) tensors with a value for each environment; differentiable.
+            parameters: by name, numbers or (B,) tensors with a value for each environment;
+                differentiable.
 
         Raises:
             InputError: an unknown name, or a value out of range.
@@ -144,7 +167,9 @@ class Robot:
         return self._changed(self.parameters, simulator=simulator, description=description)
 
     def in_gravity(self, gravity: ArrayLike) -> "Robot":
-        """Returns the robot under another gravity (3,) in axes of the world [m/s^2], without an identified tilt."""
+        """Returns the robot under another gravity (3,) in axes of the world [m/s^2],
+        without an identified tilt.
+        """
         known = {name: value for name, value in self.parameters.items() if name not in TILTS}
         simulator = replace(self.simulator, gravity=np.asarray(gravity).tolist())
         description = self.description.stepped_by(simulator, without=TILTS)
@@ -158,25 +183,29 @@ class Robot:
         return other
 
     def on(self, mesh: Mesh, **body: Any) -> "Robot":
-        """Returns a robot with the material of this one on another body, without learned force and markers.
+        """Returns a robot with the material of this one on another body,
+        without learned force and markers.
 
-        A learned force belongs to its mesh; the material does not, nor do actuators whose parts have the same names in
-        the new body: the response of their inputs goes there, too. Damping by mass stays behind, as it stands for what
-        slows this robot down beside its material. Directions of fibres are in the axes of the new mesh.
+        A learned force belongs to its mesh; the material does not, nor do actuators whose parts
+        have the same names in the new body: the response of their inputs goes there, too. Damping
+        by mass stays behind, as it stands for what slows this robot down beside its material.
+        Directions of fibres are in the axes of the new mesh.
 
         Args:
             mesh: rest shape.
-            body: settings of the body that differ, by key of the configuration, such as ``fixed={"z": 0.0}`` or
-                ``chambers=None``.
+            body: settings of the body that differ, by key of the configuration, such as
+                ``fixed={"z": 0.0}`` or ``chambers=None``.
 
         Raises:
-            InputError: an unknown setting, or one that does not fit the mesh, such as regions of the material that it
-                lacks; or a robot whose network replaces the simulator.
+            InputError: an unknown setting, or one that does not fit the mesh, such as regions of
+                the material that it lacks; or a robot whose network replaces the simulator.
             MeshError: the mesh cannot be simulated, or has no vertex where the body is fixed.
         """
         parameters = values_of_material(self.simulator, self.parameters)
         made = Robot(self.description.on(mesh, parameters, body), self.simulator.device)
-        response, actuator = moved_actuators(self.description, self.parameters, self.simulator, made.simulator)
+        response, actuator = moved_actuators(
+            self.description, self.parameters, self.simulator, made.simulator
+        )
         description = replace(made.description, parameters=parameters | response, actuator=actuator)
         return Robot(description, self.simulator.device) if response or actuator else made
 
@@ -192,14 +221,19 @@ class Robot:
 
     def __repr__(self) -> str:
         """Returns a short description: vertices, markers, time step, inputs, parameters, error."""
-        inputs = [f"  input {name} [{one.unit}]: {', '.join(one.parts)}" for name, one in self.inputs.items()]
+        inputs = [
+            f"  input {name} [{one.unit}]: {', '.join(one.parts)}"
+            for name, one in self.inputs.items()
+        ]
         return self.description.summary(self.time_step, inputs)
 
     def save(self, path: str | Path) -> Path:
-        """Writes its description to one safe file (safetensors and JSON) that `loading.load` opens on any machine.
+        """Writes its description to one safe file (safetensors and JSON)
+        that `loading.load` opens on any machine.
 
         Raises:
-            InputError: the name has another extension, something cannot be saved, or parameters differ by environment.
+            InputError: the name has another extension, something cannot be saved, or parameters
+                differ by environment.
             DataFileError: the file cannot be written.
         """
         return self.description.with_values(self.parameters).write(Path(path).expanduser())
@@ -207,23 +241,34 @@ class Robot:
     # Observation
 
     def observe(self, state: State) -> torch.Tensor:
-        """Markers (B, M, 3) in a state, as recordings have them; vertices (B, N, 3) if these are observed [m]."""
+        """Markers (B, M, 3) in a state, as recordings have them.
+
+        Vertices (B, N, 3) if these are observed [m].
+        """
         return state.q if self._observe is None else self._observe(state.q)
 
-    def half_widths(self, markers: torch.Tensor, since: ArrayLike | None = None) -> NDArray[np.float64] | None:
+    def half_widths(
+        self, markers: torch.Tensor, since: ArrayLike | None = None
+    ) -> NDArray[np.float64] | None:
         """Half-widths (..., M) of the prediction intervals of markers' coordinates.
 
         They are those of the experiment's report (`learning.intervals`); None if it has none.
 
         Args:
             markers: (..., M, 3) predicted [m].
-            since: (...,) time since the last change of the inputs [s]; None for that at which intervals are widest.
+            since: (...,) time since the last change of the inputs [s]; None for that at which
+                intervals are widest.
         """
         return self.description.half_widths(markers.detach().cpu().numpy(), since)
 
     # Initial states
 
-    def state(self, q: ArrayLike | torch.Tensor, v: ArrayLike | torch.Tensor | None = None, **inputs: Given) -> State:
+    def state(
+        self,
+        q: ArrayLike | torch.Tensor,
+        v: ArrayLike | torch.Tensor | None = None,
+        **inputs: Given,
+    ) -> State:
         """Returns a state of given positions, in which constant inputs have acted for a long time.
 
         Args:
@@ -236,7 +281,8 @@ class Robot:
         return self._commands.begin(body, self._read(inputs, len(at)))
 
     def begin(self, batch: int = 1, **inputs: Given) -> State:
-        """Returns the equilibrium of the simulator under its weight and constant inputs, without the learned force.
+        """Returns the equilibrium of the simulator under its weight and constant inputs,
+        without the learned force.
 
         Trials begin with it. A body that nothing holds (`Simulator.is_held`) keeps its rest shape.
 
@@ -274,11 +320,15 @@ class Robot:
         if self._learned is None:
             return start
         if self.is_data_driven:
-            *_, settled = states(lambda state, _: self.step(state, **inputs), start, range(POSE_STEPS))
+            *_, settled = states(
+                lambda state, _: self.step(state, **inputs), start, range(POSE_STEPS)
+            )
             return settled
         acting, predictor = self._acting(start, inputs)
         assert predictor is not None
-        body = equilibrium_under_feedback(self.simulator, acting.inputs, self.constants, start, predictor)
+        body = equilibrium_under_feedback(
+            self.simulator, acting.inputs, self.constants, start, predictor
+        )
         left = start.left if predictor.left_at is None else predictor.left_at >= 0
         return body.with_memory({**start.memory_of(), **acting.memory, "left": left})
 
@@ -289,37 +339,46 @@ class Robot:
 
         Args:
             state: before the step.
-            inputs: commands during the step by name: (C,) or (B, C) values, a number for an input of one part, or a
-                mapping from parts to numbers (other parts are zero). Omitted inputs are zero, an omitted base stays.
-                ``payload`` is a mass in kg, ``base`` the pose at the end of the step (x, y, z in m, rotation vector in
-                rad), ``external_force`` (N, 3) or (B, N, 3) in N.
+            inputs: commands during the step by name: (C,) or (B, C) values, a number for an input
+                of one part, or a mapping from parts to numbers (other parts are zero). Omitted
+                inputs are zero, an omitted base stays. ``payload`` is a mass in kg, ``base`` the
+                pose at the end of the step (x, y, z in m, rotation vector in rad),
+                ``external_force`` (N, 3) or (B, N, 3) in N.
 
         Raises:
             InputError: an unknown input or part, or values of another shape or out of range.
             ConvergenceError: the step failed, and ``on_failure`` is ``raise``.
         """
         acting, predictor = self._acting(state, inputs)
-        after = CorrectedSimulator(self.simulator, predictor, acting.inputs, self.constants).step(state, 0)
+        after = CorrectedSimulator(self.simulator, predictor, acting.inputs, self.constants).step(
+            state, 0
+        )
         if self.simulator.settings.on_failure == "raise" and bool((after.lost & ~state.lost).any()):
             raise ConvergenceError(
-                f"the robot has diverged: a vertex moved further than {DIVERGENCE_DISTANCE:g} body lengths from "
-                "where its base holds it at rest; use shorter steps, lower inputs, or a force that was trained longer.",
+                f"the robot has diverged: a vertex moved further than {DIVERGENCE_DISTANCE:g} "
+                "body lengths from where its base holds it at rest; use shorter steps, lower "
+                "inputs, or a force that was trained longer.",
                 state.q.detach(),
                 None,
             )
         return acting.remembered(state, predictor, after)
 
-    def _acting(self, state: State, inputs: Mapping[str, Given]) -> tuple[Acting, LearnedPredictor | None]:
+    def _acting(
+        self, state: State, inputs: Mapping[str, Given]
+    ) -> tuple[Acting, LearnedPredictor | None]:
         """Returns what acts in a step under commands, and the predictor of its learned force."""
         acting, learned = self.acting(state, **inputs), self._learned
         if learned is None:
             return acting, None
         conditions = None if learned.network.actuation is None else acting.conditions
         frame = None if acting.base is None else BaseFrame(acting.base, self.time_step, first=1)
-        return acting, LearnedPredictor(learned.network, conditions, learned.range_, self.frames, frame)
+        return acting, LearnedPredictor(
+            learned.network, conditions, learned.range_, self.frames, frame
+        )
 
     def drive(self, state: State, **inputs: Given) -> tuple[Inputs, Callable[[State], State]]:
-        """Returns a step's inputs with the learned force, and a map from the body after it to the robot's state.
+        """Returns a step's inputs with the learned force,
+        and a map from the body after it to the robot's state.
 
         For a simulator of several bodies (`robot_scene.RobotScene`).
 
@@ -351,8 +410,8 @@ class Robot:
             state: initial state.
             steps: T; the length of the longest input if omitted.
             on_step: called with the number of steps done.
-            inputs: by name as for `step`, either constant (C,), or a series (T, C) or (T, B, C) with values for each
-                step; the last value of a shorter series is held.
+            inputs: by name as for `step`, either constant (C,), or a series (T, C) or (T, B, C)
+                with values for each step; the last value of a shorter series is held.
 
         Raises:
             InputError: an invalid input, as for `step`, or no number of steps.
@@ -376,7 +435,9 @@ class Robot:
             name=f"{self.description.name}, {self.description.model}",
             markers=markers,
             labels=self.labels,
-            half_widths=self.half_widths(markers, since_change(self.time_step, driven, *markers.shape[:2])),
+            half_widths=self.half_widths(
+                markers, since_change(self.time_step, driven, *markers.shape[:2])
+            ),
             left=torch.stack([reached.left for reached in motion]),
             lost=torch.stack([reached.lost for reached in motion]),
             inputs=driven,

@@ -7,7 +7,18 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from typing_extensions import override
 
 from ..io.classes import ClassSettings, package_of
-from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings, Vector, Word, setting, without_null
+from ..io.settings import (
+    Count,
+    Many,
+    Natural,
+    NotNegative,
+    Positive,
+    Settings,
+    Vector,
+    Word,
+    setting,
+    without_null,
+)
 from .contact import ContactSettings, ObstacleSettings, SurfaceContactSettings
 from .mesh import BoxSettings, Curve, Direction, Divisions, MeshSettings, Place, SymmetrySettings
 from .silicones import silicone_values
@@ -17,14 +28,17 @@ LinearSolverName = Literal["auto", "banded", "tiled", "dense", "sparse", "pardis
 Integrator = Literal["implicit_euler", "bdf2", "midpoint"]
 TimeStep = Annotated[float, Field(gt=0.0, le=10.0)]
 OwnEnergies = Annotated[
-    dict[str, ClassSettings], BeforeValidator(without_null, json_schema_input_type=dict[str, ClassSettings | None])
+    dict[str, ClassSettings],
+    BeforeValidator(without_null, json_schema_input_type=dict[str, ClassSettings | None]),
 ]
 
 
 class PhysicsSettings(Settings):
     """Computation of masses and volumes."""
 
-    mass: Literal["row_sum", "per_vertex"] = setting("row_sum", "per_vertex: the mean element mass, as published")
+    mass: Literal["row_sum", "per_vertex"] = setting(
+        "row_sum", "per_vertex: the mean element mass, as published"
+    )
     volume_integration: Literal["centre", "full"] = setting(
         "centre", "integration of the volume term; full locks, as published"
     )
@@ -39,14 +53,18 @@ class _Parameters(Settings):
     @model_validator(mode="before")
     @classmethod
     def _of_other_package(cls, values: Any) -> Any:
-        """Takes Hydra's ``_target_``, a class of another package, as the model, and the law of a silicone by name."""
+        """Takes Hydra's ``_target_``, a class of another package,
+        as the model, and the law of a silicone by name.
+        """
         if not isinstance(values, dict):
             return values
         if values.get("_target_") is None:
             return silicone_values(values)
         if values.get("model") is not None:
             raise ValueError("model and _target_ are both given: set one of them to null.")
-        return {key: value for key, value in values.items() if key != "_target_"} | {"model": values["_target_"]}
+        return {key: value for key, value in values.items() if key != "_target_"} | {
+            "model": values["_target_"]
+        }
 
     @override
     def packages(self) -> dict[str, str]:
@@ -67,27 +85,37 @@ def _without_default(schema: dict[str, Any]) -> None:
 class RegionMaterialSettings(_Parameters):
     """The material of a region; parameters that are left out are those of the group around it."""
 
-    model: Word | None = setting(None, "constitutive model; a different one has its own parameters alone")
+    model: Word | None = setting(
+        None, "constitutive model; a different one has its own parameters alone"
+    )
 
 
 def _of_material(schema: dict[str, Any]) -> None:
     """Lets editors accept the parameters of any material, and the name of a silicone."""
     schema["additionalProperties"] = {"anyOf": [{"type": "number"}, {"type": "null"}]}
-    schema["properties"]["name"] = {"type": "string", "description": "of the silicone, where the model is silicone"}
+    schema["properties"]["name"] = {
+        "type": "string",
+        "description": "of the silicone, where the model is silicone",
+    }
 
 
 class MaterialSettings(_Parameters):
-    """A material and its parameters, in SI units, as `energies.materials` lists them; null takes one out."""
+    """A material and its parameters, in SI units, as `energies.materials` lists them.
+
+    Null takes one out.
+    """
 
     model_config = ConfigDict(json_schema_extra=_of_material)
 
     model: Word = Field(
         "corotated",
-        description="constitutive model, corotated by default; silicone: the law of a silicone of the package by its "
-        "name; _target_ instead: a class of another package",
+        description="constitutive model, corotated by default; silicone: the law of a silicone "
+        "of the package by its name; _target_ instead: a class of another package",
         json_schema_extra=_without_default,
     )
-    regions: dict[str, RegionMaterialSettings] = setting({}, "materials of regions of the mesh, by name")
+    regions: dict[str, RegionMaterialSettings] = setting(
+        {}, "materials of regions of the mesh, by name"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -102,14 +130,17 @@ class MaterialSettings(_Parameters):
         common: dict[str, Any] = {"model": self.model, **self.values}
         return {
             name: MaterialSettings(
-                **(common if region.model in (None, self.model) else {"model": region.model}) | region.values
+                **(common if region.model in (None, self.model) else {"model": region.model})
+                | region.values
             )
             for name, region in self.regions.items()
         }
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values by parameter of the simulator, such as ``tip_youngs_modulus`` for a region ``tip``."""
+        """Values by parameter of the simulator, such
+        as ``tip_youngs_modulus`` for a region ``tip``.
+        """
         return {
             f"{region}_{name}" if region else name: value
             for region, material in self.by_region.items()
@@ -121,18 +152,26 @@ class Rigid(Settings):
     """A nearly rigid region of a mesh, such as an end cap, a base plate or an insert."""
 
     density: Positive = setting(1200.0, unit="kg/m^3")
-    stiffness: Positive = setting(1.0e9, "kappa of the energy kappa V |F - R(F)|^2, which penalises deformation", "Pa")
+    stiffness: Positive = setting(
+        1.0e9, "kappa of the energy kappa V |F - R(F)|^2, which penalises deformation", "Pa"
+    )
 
 
 class PartSettings(Settings):
-    """A further mesh of the body, with cells of the same kind, which form a region with the name of the part."""
+    """A further mesh of the body, with cells of the same kind,
+    which form a region with the name of the part.
+    """
 
     mesh: MeshSettings
-    shift: Vector = setting((0.0, 0.0, 0.0), "displacement from the coordinates of its own mesh", "m")
+    shift: Vector = setting(
+        (0.0, 0.0, 0.0), "displacement from the coordinates of its own mesh", "m"
+    )
 
 
 class GlueSettings(Settings):
-    """Glue between regions whose cells do not match: vertices that follow another region, by `fem.bodies.Glue`."""
+    """Glue between regions whose cells do not match:
+    vertices that follow another region, by `fem.bodies.Glue`.
+    """
 
     region: Word = setting(description="region with the glued vertices")
     at: Place = setting(description="where the glued vertices of that region lie")
@@ -146,21 +185,30 @@ class ChamberSettings(Settings):
     count: Count = setting(0, "expected number of closed chambers of the mesh")
     axis: Direction = setting((0.0, 0.0, -1.0), "direction in which closed chambers are numbered")
     faces: dict[str, Place | Word] = setting(
-        {}, "open faces by name: those with all vertices at a place, or a named surface of the mesh file"
+        {},
+        "open faces by name: those with all vertices at a place, "
+        "or a named surface of the mesh file",
     )
 
     @model_validator(mode="after")
     def _presses(self) -> Self:
         if not self.count and not self.faces:
-            raise ValueError("count is 0, and faces has none: give the number of chambers, or faces under pressure.")
+            raise ValueError(
+                "count is 0, and faces has none: "
+                "give the number of chambers, or faces under pressure."
+            )
         return self
 
 
 class FibreSettings(Settings):
     """Fibres wound around the chambers, or around the body."""
 
-    around: Literal["chambers", "outside"] = setting("chambers", "surface in which they lie; both need chambers")
-    angles: Many[float] = setting(description="angles from the circumference, one per family", unit="degrees")
+    around: Literal["chambers", "outside"] = setting(
+        "chambers", "surface in which they lie; both need chambers"
+    )
+    angles: Many[float] = setting(
+        description="angles from the circumference, one per family", unit="degrees"
+    )
     toe: Positive = setting(1.0e-3, "strain over which fibres become taut")
     stiffness: NotNegative = setting(description="stiffness of a family, per length", unit="N/m")
 
@@ -182,14 +230,19 @@ class Route(Settings):
         if any(first == second for first, second in pairwise(self.guides)):
             raise ValueError("guides has two in a row at one place: leave one of them out.")
         if not fixed <= {*range(count)}:
-            raise ValueError(f"fixed_guides is {list(self.fixed_guides)}: the route has guides 0 to {count - 1}.")
+            raise ValueError(
+                f"fixed_guides is {list(self.fixed_guides)}: the route has guides 0 to {count - 1}."
+            )
         if len(fixed) == count:
-            raise ValueError("fixed_guides has all guides, so that the tendon does not pull on the body: take one out.")
+            raise ValueError(
+                "fixed_guides has all guides, so that the tendon does not pull "
+                "on the body: take one out."
+            )
         for offset in self.offsets:
             if isinstance(offset[0], tuple) and len(offset) != count:
                 raise ValueError(
-                    f"offsets has a direction for {len(offset)} guides: give three numbers, or three for each of its "
-                    f"{count} guides."
+                    f"offsets has a direction for {len(offset)} guides: give three numbers, or "
+                    f"three for each of its {count} guides."
                 )
         return self
 
@@ -208,7 +261,10 @@ class TendonSettings(Settings):
     @model_validator(mode="after")
     def _pulls(self) -> Self:
         if self.commanded == "contraction" and not self.stiffness > 0.0:
-            raise ValueError("stiffness is 0, but contractions are commanded, which act through it: set it, in N/m.")
+            raise ValueError(
+                "stiffness is 0, but contractions are commanded, "
+                "which act through it: set it, in N/m."
+            )
         return self
 
 
@@ -226,7 +282,9 @@ class MuscleSettings(Settings):
     commanded: Literal["stress", "contraction"] | None = setting(
         None, "input of the muscles; null: passive fibres, which stiffen the body in tension"
     )
-    stiffness: NotNegative = setting(description="required for commanded contractions and passive fibres", unit="Pa")
+    stiffness: NotNegative = setting(
+        description="required for commanded contractions and passive fibres", unit="Pa"
+    )
     toe: Positive = setting(1.0e-3, "strain over which fibres become taut")
 
     @model_validator(mode="after")
@@ -252,15 +310,21 @@ class SolverSettings(Settings):
     """Settings of the solver of a step, `dynamics.nonlinear_solver`."""
 
     name: SolverName = setting("quasi_newton", "method")
-    relative_tolerance: Annotated[float, Field(gt=0.0, le=0.1)] = setting(1.0e-8, "residual over the forces in balance")
-    absolute_tolerance: NotNegative = setting(1.0e-12, "residual at which a step is always solved", "N")
+    relative_tolerance: Annotated[float, Field(gt=0.0, le=0.1)] = setting(
+        1.0e-8, "residual over the forces in balance"
+    )
+    absolute_tolerance: NotNegative = setting(
+        1.0e-12, "residual at which a step is always solved", "N"
+    )
     max_iterations: Natural = setting(500, "iterations after which a step fails")
     memory: Natural = setting(12, "number of pairs that L-BFGS keeps")
     linear_solver: LinearSolverName = setting("auto", "linear solver; pardiso needs a CPU")
     factors: Literal["double", "single"] = setting(
         "double", "precision of factors and L-BFGS pairs; results stay accurate"
     )
-    on_failure: Literal["raise", "count"] = setting("raise", "effect of a failed step; count continues")
+    on_failure: Literal["raise", "count"] = setting(
+        "raise", "effect of a failed step; count continues"
+    )
 
 
 class BodySettings(Settings):
@@ -268,32 +332,46 @@ class BodySettings(Settings):
 
     mesh: MeshSettings
     physics: PhysicsSettings = PhysicsSettings()
-    parts: dict[str, PartSettings] = setting({}, "further meshes; the cells of the first one are the region 'body'")
+    parts: dict[str, PartSettings] = setting(
+        {}, "further meshes; the cells of the first one are the region 'body'"
+    )
     glued: Many[GlueSettings] = setting((), "glue between meshes that do not match")
-    regions: dict[str, BoxSettings] = setting({}, "cells by region, beside the regions of a mesh file")
+    regions: dict[str, BoxSettings] = setting(
+        {}, "cells by region, beside the regions of a mesh file"
+    )
     rigid: dict[str, Rigid] = setting({}, "rigid regions")
-    fixed: Place | None = setting(description="fixed vertices; null: none, of a body that lies on obstacles")
+    fixed: Place | None = setting(
+        description="fixed vertices; null: none, of a body that lies on obstacles"
+    )
     symmetry: SymmetrySettings | None = setting(None, "symmetry planes that cut the body")
     chambers: ChamberSettings | None = setting(None, "chambers and open faces under pressure")
     fibres: FibreSettings | None = setting(None, "fibres around the chambers, or around the body")
     tendons: TendonSettings | None = setting(None, "tendons that pull")
     muscles: MuscleSettings | None = setting(None, "contractile fibres")
     medium: MediumSettings | None = setting(None, "fluid around the body")
-    obstacles: dict[str, ObstacleSettings] = setting({}, "rigid obstacles that the body touches, by name")
+    obstacles: dict[str, ObstacleSettings] = setting(
+        {}, "rigid obstacles that the body touches, by name"
+    )
     contact: ContactSettings = setting(ContactSettings(), "contact with the obstacles")
     energies: OwnEnergies = setting(
         {}, "energies and actuators of other packages, by name, with their arguments; null: none"
     )
     self_contact: SurfaceContactSettings | None = setting(
-        None, "contact of the body with itself and of its parts with one another; null: they pass through one another"
+        None,
+        "contact of the body with itself and of its parts with one another; null: they pass "
+        "through one another",
     )
 
     @model_validator(mode="after")
     def _touches(self) -> Self:
         if not self.obstacles and self.contact != ContactSettings():
-            raise ValueError("contact is set, but obstacles has none: name an obstacle, or leave contact out.")
+            raise ValueError(
+                "contact is set, but obstacles has none: name an obstacle, or leave contact out."
+            )
         if self.fixed is None and not self.obstacles and self.symmetry is None:
-            raise ValueError("fixed is null, and obstacles has none that the body lies on: name fixed vertices.")
+            raise ValueError(
+                "fixed is null, and obstacles has none that the body lies on: name fixed vertices."
+            )
         return self
 
 
@@ -310,7 +388,9 @@ class TargetSettings(SteppedSettings):
     # `run.filled` moves parameters that stand directly in ``target`` into its material.
     model_config = ConfigDict(
         json_schema_extra={
-            "additionalProperties": {"anyOf": [{"type": "number"}, {"type": "string"}, {"type": "null"}]}
+            "additionalProperties": {
+                "anyOf": [{"type": "number"}, {"type": "string"}, {"type": "null"}]
+            }
         }
     )
 

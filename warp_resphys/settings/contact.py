@@ -14,8 +14,12 @@ from .mesh import Direction, LengthUnit
 class Obstacle(Settings):
     """A rigid body."""
 
-    position: Vector = setting((0.0, 0.0, 0.0), "position of its centre; of a half-space, a point of its plane", "m")
-    axis: Direction = setting((0.0, 0.0, 1.0), "direction of its z axis: a half-space's normal, a cylinder's axis")
+    position: Vector = setting(
+        (0.0, 0.0, 0.0), "position of its centre; of a half-space, a point of its plane", "m"
+    )
+    axis: Direction = setting(
+        (0.0, 0.0, 1.0), "direction of its z axis: a half-space's normal, a cylinder's axis"
+    )
     moves: bool = setting(False, "moves by `data.obstacle_motion` or inputs of a robot")
 
     @property
@@ -55,7 +59,9 @@ class _Rod(Obstacle):
     """A shape of revolution."""
 
     radius: Positive = setting(unit="m")
-    length: Positive = setting(description="length along its axis, of a capsule without the half-spheres", unit="m")
+    length: Positive = setting(
+        description="length along its axis, of a capsule without the half-spheres", unit="m"
+    )
 
     @property
     @override
@@ -99,7 +105,9 @@ class SurfaceFile(Obstacle):
     spacing: Positive = setting(1.0e-3, "spacing of the grid, which rounds edges", "m")
 
 
-ObstacleSettings = Annotated[HalfSpace | Sphere | Capsule | Cylinder | Box | SurfaceFile, Field(discriminator="shape")]
+ObstacleSettings = Annotated[
+    HalfSpace | Sphere | Capsule | Cylinder | Box | SurfaceFile, Field(discriminator="shape")
+]
 
 
 class FrictionPair(Settings):
@@ -114,20 +122,30 @@ class FrictionPair(Settings):
 
 
 class SurfaceContactSettings(Settings):
-    """Contact of the body with itself, and of its parts with one another, by `energies.contact.surface_contact`."""
+    """Contact of the body with itself, and of its parts with one another, by
+    `energies.contact.surface_contact`.
+    """
 
     stiffness: Positive = setting(1.0e5, "stiffness of the barrier", "Pa")
     friction: NotNegative = setting(0.0, "coefficient of friction")
     distance: Positive = setting(1.0e-3, "gap at which contact begins", "m")
     slip_speed: Positive = setting(1.0e-3, "speed at which friction is fully developed", "m/s")
-    pairs: dict[str, FrictionPair] = setting({}, "friction of pairs of regions, by name, the first that fits")
+    pairs: dict[str, FrictionPair] = setting(
+        {}, "friction of pairs of regions, by name, the first that fits"
+    )
 
 
 class ContactSettings(Settings):
     """Contact of the body with its obstacles, by `energies.contact.obstacle_contact`."""
 
-    stiffness: Positive | dict[str, Positive] = setting(1.0e5, "stiffness of the barrier, or one per obstacle", "Pa")
-    friction: NotNegative | dict[str, NotNegative] = setting(0.0, "coefficient, or one per obstacle")
+    stiffness: Positive | dict[str, Positive] = setting(
+        1.0e5, "stiffness of the barrier, or one per obstacle", "Pa"
+    )
+    friction: NotNegative | dict[str, NotNegative] = setting(
+        0.0, "coefficient, or one per obstacle"
+    )
     distance: Positive = setting(1.0e-3, "gap at which contact begins", "m")
     slip_speed: Positive = setting(1.0e-3, "speed at which friction is fully developed", "m/s")
-    friction_factors: dict[str, NotNegative] = setting({}, "factors of the friction of regions of the mesh, by name")
+    friction_factors: dict[str, NotNegative] = setting(
+        {}, "factors of the friction of regions of the mesh, by name"
+    )

@@ -4,16 +4,38 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from ..io.settings import Count, Natural, NotNegative, Positive, Settings, Some, Vector, Word, setting
+from ..io.settings import (
+    Count,
+    Natural,
+    NotNegative,
+    Positive,
+    Settings,
+    Some,
+    Vector,
+    Word,
+    setting,
+)
 from .mesh import Direction
 from .performed import different
 
 Model = Literal[
-    "published", "simulation", "sysid_elastic", "sysid", "law", "actuator", "simfree", "resphys_uncorrected", "resphys"
+    "published",
+    "simulation",
+    "sysid_elastic",
+    "sysid",
+    "law",
+    "actuator",
+    "simfree",
+    "resphys_uncorrected",
+    "resphys",
 ]
 Models = Annotated[Some[Model], AfterValidator(different)]
 Shape = Annotated[
-    str, Field(pattern="^(circle|eight|[A-Z])$", json_schema_extra={"wanted": "circle, eight or a capital letter"})
+    str,
+    Field(
+        pattern="^(circle|eight|[A-Z])$",
+        json_schema_extra={"wanted": "circle, eight or a capital letter"},
+    ),
 ]
 Numbers = Annotated[Some[Positive], AfterValidator(different)]
 
@@ -42,7 +64,9 @@ class FeedbackSettings(Settings):
     """Feedback by a measured Jacobian."""
 
     gains: Numbers = setting((0.5, 1.0, 2.0), unit="1/s")
-    settles: Positive = setting(1.5, "time after a change of inputs after which the Jacobian is measured", "s")
+    settles: Positive = setting(
+        1.5, "time after a change of inputs after which the Jacobian is measured", "s"
+    )
 
 
 class ReductionSettings(Settings):
@@ -70,11 +94,15 @@ class ReductionSettings(Settings):
 class FigureSettings(Settings):
     """Paths, such as figures and letters, for the mean of some markers."""
 
-    tracked: Annotated[Some[Word], AfterValidator(different)] = setting(description="names of the markers")
+    tracked: Annotated[Some[Word], AfterValidator(different)] = setting(
+        description="names of the markers"
+    )
     shapes: Annotated[Some[Shape], AfterValidator(different)] = setting(
         ("eight", "circle", "R", "E", "S"), "circle, eight or capital letters"
     )
-    seconds: Numbers = setting((4.0, 2.0), "durations of a path, beside a quarter of that before it", "s")
+    seconds: Numbers = setting(
+        (4.0, 2.0), "durations of a path, beside a quarter of that before it", "s"
+    )
     centre: Vector = setting(description="centre of the figure", unit="m")
     size: Positive = setting(0.05, "length of the larger side", "m")
     right: Direction = setting((1.0, 0.0, 0.0), "direction to the right in the plane of the figure")
@@ -86,7 +114,8 @@ class ControlSettings(FigureSettings):
     """Control along paths."""
 
     models: Models = setting(
-        ("simulation", "sysid", "resphys"), "models for plans of whole motions; others are compared with the last"
+        ("simulation", "sysid", "resphys"),
+        "models for plans of whole motions; others are compared with the last",
     )
     receding: Models = setting(("resphys",), "those with a receding horizon")
     plan: PlanSettings = PlanSettings()

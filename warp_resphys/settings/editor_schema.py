@@ -2,7 +2,8 @@
 
     python -m warp_resphys.settings.editor_schema configs/settings.schema.json
 
-The files begin with ``# yaml-language-server: $schema=settings.schema.json`` (a path from that file, or absolute).
+The files begin with ``# yaml-language-server: $schema=settings.schema.json`` (a path from that
+file, or absolute).
 """
 
 import sys
@@ -14,7 +15,9 @@ from .run import RunSettings
 
 
 def editor_schema() -> dict[str, Any]:
-    """Returns the JSON Schema of a file of settings, in which keys may be missing, as it extends other options."""
+    """Returns the JSON Schema of a file of settings,
+    in which keys may be missing, as it extends other options.
+    """
     schema: dict[str, Any] = _partial(RunSettings.model_json_schema())
     schema["properties"] |= {"defaults": {"type": "array"}, "hydra": {"type": "object"}}
     return schema
@@ -23,7 +26,11 @@ def editor_schema() -> dict[str, Any]:
 def _partial(node: Any) -> Any:
     """A JSON Schema without lists of required keys, in which groups may replace others."""
     if isinstance(node, Mapping):
-        part = {key: _partial(value) for key, value in node.items() if key != "required" or not isinstance(value, list)}
+        part = {
+            key: _partial(value)
+            for key, value in node.items()
+            if key != "required" or not isinstance(value, list)
+        }
         replaces = {"properties": {**part.get("properties", {}), "_replace_": {"type": "boolean"}}}
         return part | replaces if part.get("type") == "object" else part
     return list(map(_partial, node)) if isinstance(node, list) else node

@@ -6,7 +6,19 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
-from ..io.settings import Count, Many, Natural, NotNegative, Pair, Positive, Settings, Some, Vector, Word, setting
+from ..io.settings import (
+    Count,
+    Many,
+    Natural,
+    NotNegative,
+    Pair,
+    Positive,
+    Settings,
+    Some,
+    Vector,
+    Word,
+    setting,
+)
 from .mesh import LengthUnit, Place
 from .performed import LimitSettings, WithoutMotion, different
 
@@ -17,7 +29,9 @@ _Rows = Annotated[Many[Vector], Field(min_length=3, max_length=3)]
 class ColourSettings(Settings):
     """Colours of a body in a picture."""
 
-    hue: Pair[float] = setting(description="first and last hue; the interval may pass 360", unit="degrees")
+    hue: Pair[float] = setting(
+        description="first and last hue; the interval may pass 360", unit="degrees"
+    )
     saturation: _Fraction = setting(0.5, "least saturation")
     value: _Fraction = setting(0.1, "least value (brightness)")
 
@@ -32,13 +46,20 @@ class LensSettings(Settings):
     @model_validator(mode="after")
     def _has_one(self) -> Self:
         if (self.file is None) == (self.matrix is None):
-            raise ValueError("file and matrix: give one of them, a calibration or the matrix; null takes one out.")
+            raise ValueError(
+                "file and matrix: give one of them, "
+                "a calibration or the matrix; null takes one out."
+            )
         return self
 
 
 def _kind_of_lens(value: object) -> str:
     """Whether settings of lenses are those of one, or of several by their names."""
-    one = isinstance(value, LensSettings) or not isinstance(value, Mapping) or {*value} & {*LensSettings.model_fields}
+    one = (
+        isinstance(value, LensSettings)
+        or not isinstance(value, Mapping)
+        or {*value} & {*LensSettings.model_fields}
+    )
     return "one" if one else "several"
 
 
@@ -59,9 +80,13 @@ class CloudSettings(Settings):
 
 
 class TagSettings(Settings):
-    """A square tag on the clamp, from which the camera's place is computed in place of world_to_camera."""
+    """A square tag on the clamp, from which the camera's place is computed
+    in place of world_to_camera.
+    """
 
-    dictionary: Word = setting("6x6_250", "dictionary of OpenCV's ArUco tags, such as 4x4_50 or apriltag_36h11")
+    dictionary: Word = setting(
+        "6x6_250", "dictionary of OpenCV's ArUco tags, such as 4x4_50 or apriltag_36h11"
+    )
     number: Count = setting(0, "number of the tag")
     size: Positive = setting(description="edge of its black square", unit="m")
     centre: Vector = setting((0.0, 0.0, 0.0), "centre of the tag in the axes of the mesh", "m")
@@ -80,18 +105,24 @@ class ReleasedForceSettings(Settings):
 class PoseSettings(Settings):
     """A body at rest, or one that is released, and the folder of its pictures."""
 
-    folder: Word = setting(description="with camera.json and the pictures, in the folder of the data")
+    folder: Word = setting(
+        description="with camera.json and the pictures, in the folder of the data"
+    )
     mesh: Word | None = setting(None, "file of its mesh, in its folder; null: the group mesh")
     material: Word | None = setting(None, "name of its material; null: one material")
     frames: Annotated[Some[Count], AfterValidator(different)] | None = setting(
         None, "numbers of the frames, from 0; null: all"
     )
-    mask: ColourSettings | None = setting(None, "colours of the body, where its frames have no masks; null: data.mask")
+    mask: ColourSettings | None = setting(
+        None, "colours of the body, where its frames have no masks; null: data.mask"
+    )
     outline: bool = setting(True, "whether the body's outline is compared")
     points: Word | None = setting(None, "file of tracked points, a row per frame")
     cloud: Word | None = setting(None, "file of a scan: .ply, .xyz, .pcd, .npy, .obj, .off or .stl")
     depth: bool = setting(True, "whether depth images of its frames are compared")
-    gravity: Vector | None = setting(None, "gravity in the axes of the scene; null: as configured", "m/s^2")
+    gravity: Vector | None = setting(
+        None, "gravity in the axes of the scene; null: as configured", "m/s^2"
+    )
     clamp_turn: float = setting(0.0, "rotation of the second clamp against the first", "degrees")
     release: ReleasedForceSettings | None = setting(
         None, "release of a force, after which the body moves, in frames with times; null: it rests"
@@ -101,12 +132,16 @@ class PoseSettings(Settings):
 class SimulatedCamera(Settings):
     """A simulated laboratory of pictures, on the body of the configuration."""
 
-    material: dict[str, float] = setting({}, "parameters of the true material that differ from the simulation")
+    material: dict[str, float] = setting(
+        {}, "parameters of the true material that differ from the simulation"
+    )
     corrections: dict[str, float] = setting({}, "true corrections by parameter")
     noise: NotNegative = setting(1.0, "standard deviation of outlines and tracked points", "px")
     frames: Natural = setting(60, "number of frames of a released body")
     frame_rate: Positive = setting(60.0, "rate of these frames", "Hz")
-    row_time: float | None = setting(None, "true time between two rows; null: that of the lens", "s")
+    row_time: float | None = setting(
+        None, "true time between two rows; null: that of the lens", "s"
+    )
     substeps: Natural = setting(2, "substeps per time step in true motions")
     depth: NotNegative | None = setting(None, "standard deviation of depth images; null: none", "m")
     size: Pair[Natural] = setting((1280, 720), "width and height of the pictures", "px")
@@ -120,7 +155,8 @@ class PictureData(WithoutMotion):
     kind: Literal["pictures"]
     folder: Word | None = setting(None, "folder of the pictures")
     lens: _Lenses | None = setting(
-        None, "lens of the camera; of several cameras, by name: {left: {file: left.yaml}, right: {...}}"
+        None,
+        "lens of the camera; of several cameras, by name: {left: {file: left.yaml}, right: {...}}",
     )
     tag: TagSettings | None = setting(None, "tag on the clamp; null: frames have world_to_camera")
     stands: bool = setting(True, "the camera stands still during a pose")
@@ -130,7 +166,9 @@ class PictureData(WithoutMotion):
     points: dict[str, Vector] = setting({}, "tracked points on the undeformed body, by name", "m")
     likelihood: _Fraction = setting(0.6, "least likelihood of a tracked point")
     cloud: CloudSettings = setting(CloudSettings(), "settings of scans and depth images")
-    materials: dict[str, dict[str, float]] = setting({}, "parameters by material, where they differ from simulation")
+    materials: dict[str, dict[str, float]] = setting(
+        {}, "parameters by material, where they differ from simulation"
+    )
     poses: dict[str, PoseSettings] = setting(description="poses by name")
     train: Some[Word] = setting(description="poses that identify the material")
     test: Many[Word] = setting((), "poses that are predicted with it")
@@ -142,37 +180,54 @@ class PictureData(WithoutMotion):
     def _are_known(self) -> Self:
         for key, names in (("train", self.train), ("test", self.test)):
             if unknown := [name for name in names if name not in self.poses]:
-                raise ValueError(f"{key} names '{unknown[0]}': data.poses has {', '.join(self.poses)}.")
+                raise ValueError(
+                    f"{key} names '{unknown[0]}': data.poses has {', '.join(self.poses)}."
+                )
         if both := [name for name in self.train if name in self.test]:
-            raise ValueError(f"test names '{both[0]}', which is in data.train as well: take one out.")
-        if pointed := [name for name, pose in self.poses.items() if pose.points is not None and not self.points]:
             raise ValueError(
-                f"points is empty, and data.poses.{pointed[0]} has some: give their places, {{tip: [x, y, z]}}."
+                f"test names '{both[0]}', which is in data.train as well: take one out."
+            )
+        if pointed := [
+            name for name, pose in self.poses.items() if pose.points is not None and not self.points
+        ]:
+            raise ValueError(
+                f"points is empty, and data.poses.{pointed[0]} has some: give their places, "
+                "{tip: [x, y, z]}."
             )
         used = {pose.material for pose in self.poses.values()} - {None}
         if used and (missing := sorted(str(name) for name in used if name not in self.materials)):
-            raise ValueError(f"materials lacks '{missing[0]}', which a pose names: give it, or {{}}.")
-        owners = {"data.poses": [*self.poses], "data.materials": [*self.materials], "data.lens": [*self.lenses]}
+            raise ValueError(
+                f"materials lacks '{missing[0]}', which a pose names: give it, or {{}}."
+            )
+        owners = {
+            "data.poses": [*self.poses],
+            "data.materials": [*self.materials],
+            "data.lens": [*self.lenses],
+        }
         for (first, mine), (second, others) in combinations(owners.items(), 2):
             if both := [name for name in mine if name in others]:
                 raise ValueError(f"{first} and {second} both have '{both[0]}': rename one.")
-        if unseen := {self.poses[name].material for name in self.test} - {self.poses[n].material for n in self.train}:
+        if unseen := {self.poses[name].material for name in self.test} - {
+            self.poses[n].material for n in self.train
+        }:
             raise ValueError(
-                f"test has a pose of {min(map(str, unseen))}, of which no pose is in data.train: take it out."
+                f"test has a pose of {min(map(str, unseen))}, "
+                "of which no pose is in data.train: take it out."
             )
         if self.folder is None and self.simulated is None:
             raise ValueError("folder is not set: give the folder of the pictures.")
         if self.folder is not None and self.simulated is not None:
             raise ValueError(
-                "simulated is for pictures without a folder, and data.folder is set: set data.simulated to null for "
-                "the pictures of the folder, or data.folder for those of the simulated camera."
+                "simulated is for pictures without a folder, and data.folder is set: set "
+                "data.simulated to null for the pictures of the folder, or data.folder for those "
+                "of the simulated camera."
             )
         if self.simulated is not None:
             for name, pose in self.poses.items():
                 if pose.mesh or pose.material or pose.cloud or pose.clamp_turn:
                     raise ValueError(
-                        f"poses.{name} has a mesh, a material, a scan or a turned clamp, which the simulated camera "
-                        "does not play: leave them out."
+                        f"poses.{name} has a mesh, a material, a scan or a turned clamp, which "
+                        "the simulated camera does not play: leave them out."
                     )
             if [*self.lenses] != [""]:
                 raise ValueError("lens must be a single one for the simulated camera.")
@@ -188,11 +243,15 @@ class PictureData(WithoutMotion):
         return {} if self.lens is None else {"": self.lens}
 
     def limited(self) -> "PictureData":
-        """Returns the data with as many poses of training, and of the test of their materials, as the limit allows."""
+        """Returns the data with as many poses of training,
+        and of the test of their materials, as the limit allows.
+        """
         if self.limit is None:
             return self
         train = self.train[: self.limit.train]
         seen = {self.poses[name].material for name in train}
-        test = tuple(name for name in self.test if self.poses[name].material in seen)[: self.limit.test]
+        test = tuple(name for name in self.test if self.poses[name].material in seen)[
+            : self.limit.test
+        ]
         poses = {name: pose for name, pose in self.poses.items() if name in (*train, *test)}
         return self.model_copy(update={"train": train, "test": test, "poses": poses})

@@ -1,4 +1,6 @@
-"""Settings of simulations that stand in for real bodies: a laboratory, and other bodies of the same material."""
+"""Settings of simulations that stand in for real bodies:
+a laboratory, and other bodies of the same material.
+"""
 
 from typing import Annotated, Self
 
@@ -26,7 +28,9 @@ class PlaySettings(TargetSettings):
     model_config = ConfigDict(json_schema_extra={"additionalProperties": False})
 
     sequences: SequenceSettings = setting(SequenceSettings(), "random inputs")
-    rate: Positive | None = setting(None, "frame rate of the cameras; null: one frame per time step", "Hz")
+    rate: Positive | None = setting(
+        None, "frame rate of the cameras; null: one frame per time step", "Hz"
+    )
     noise: NotNegative = setting(description="noise of a coordinate of a marker", unit="m")
     placement_noise: NotNegative = setting(
         description="noise of a coordinate of a marker's position on the body", unit="m"
@@ -35,8 +39,12 @@ class PlaySettings(TargetSettings):
         0.0, "noise of a component of a rigid body's rotation", unit="degrees"
     )
     zero_noise: NotNegative = setting(0.0, "noise of the zero of recorded inputs")
-    tilt: Annotated[float, Field(ge=0.0, le=20.0)] = setting(0.0, "tilt of the body from level", "degrees")
-    held_seconds: Annotated[float, Field(ge=0.25)] | None = setting(None, "recorded duration before the release", "s")
+    tilt: Annotated[float, Field(ge=0.0, le=20.0)] = setting(
+        0.0, "tilt of the body from level", "degrees"
+    )
+    held_seconds: Annotated[float, Field(ge=0.25)] | None = setting(
+        None, "recorded duration before the release", "s"
+    )
     seconds: Positive | None = setting(None, "recorded after the release", "s")
 
 
@@ -58,25 +66,31 @@ class LaboratorySettings(PlaySettings):
 
 
 class ShapeSettings(BodySettings):
-    """Another body of the same material, simulated beside a target of its own: held, released, and compared.
+    """Another body of the same material, simulated beside a target of its own:
+    held, released, and compared.
 
     It has its own actuators alone.
     """
 
     target_mesh: MeshSettings | None = setting(None, "mesh of its target; null: the same")
     held: HeldSettings | None = setting(None, "how it is held before its release")
-    inputs: Many[float] | None = setting(None, "inputs before the release, one per chamber, tendon or muscle")
+    inputs: Many[float] | None = setting(
+        None, "inputs before the release, one per chamber, tendon or muscle"
+    )
 
     @model_validator(mode="after")
     def _begins(self) -> Self:
         if self.held is None and self.inputs is None:
             raise ValueError(
-                "held is null, and so is inputs: give one of them, what bends the body before its release."
+                "held is null, and so is inputs: give one of them, "
+                "what bends the body before its release."
             )
         if self.held is not None and self.inputs is not None:
             raise ValueError("inputs is set, but held is set as well: take one of them out.")
         if self.held is not None and not self.held.twist_deg and self.held.at is None:
-            raise ValueError("held.at is null: name the vertices that carry the weight, as in {x: 0.2}.")
+            raise ValueError(
+                "held.at is null: name the vertices that carry the weight, as in {x: 0.2}."
+            )
         return self
 
     @property

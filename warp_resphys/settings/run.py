@@ -26,11 +26,12 @@ class RunSettings(RunKeys):
 
 
 def filled(values: Any) -> Any:
-    """Returns the plain values of a run, with the keys that some groups leave out copied from other groups.
+    """Returns the plain values of a run, with the keys
+    that some groups leave out copied from other groups.
 
-    These are ``network`` and ``trainer`` of ``simfree``, and in ``target`` and ``laboratory`` all keys of
-    `TargetSettings`, with ``simulation`` as the material. Numbers and the model of a material may stand directly in
-    ``target``; null takes one out.
+    These are ``network`` and ``trainer`` of ``simfree``, and in ``target`` and ``laboratory`` all
+    keys of `TargetSettings`, with ``simulation`` as the material. Numbers and the model of a
+    material may stand directly in ``target``; null takes one out.
     """
     if not isinstance(values, Mapping):
         return values
@@ -40,19 +41,27 @@ def filled(values: Any) -> Any:
         merged: dict[str, Any] = {}
         for key in ("network", "trainer"):
             whole, changes = _mapping(values.get(key, {})), _mapping(simfree.get(key, {}))
-            merged[key] = simfree.get(key) if whole is None or changes is None else {**whole, **changes}
+            merged[key] = (
+                simfree.get(key) if whole is None or changes is None else {**whole, **changes}
+            )
         values["simfree"] = merged
     keys = TargetSettings.model_fields
-    common = {key: values.get(key) for key, field in keys.items() if key in values or field.is_required()}
+    common = {
+        key: values.get(key) for key, field in keys.items() if key in values or field.is_required()
+    }
     for group in ("target", "laboratory"):
         part = values.get(group)
         if isinstance(part, Mapping):
-            direct = {key: x for key, x in part.items() if key not in keys and not isinstance(x, Mapping)}
+            direct = {
+                key: x for key, x in part.items() if key not in keys and not isinstance(x, Mapping)
+            }
             known = direct if group == "target" else {}
             material = _mapping(part.get("material", {}))
             if known and material is not None:
                 part = {key: value for key, value in part.items() if key not in known}
-                part["material"] = {key: value for key, value in {**known, **material}.items() if value is not None}
+                part["material"] = {
+                    key: value for key, value in {**known, **material}.items() if value is not None
+                }
             values[group] = {**common, "material": values.get("simulation"), **part}
     return values
 

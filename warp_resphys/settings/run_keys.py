@@ -6,7 +6,14 @@ from pydantic import BeforeValidator, Field
 
 from ..io.errors import InputError
 from ..io.settings import Natural, Pair, Settings, Word, parse, setting
-from .body import Integrator, MaterialSettings, PhysicsSettings, SimulatorSettings, SteppedSettings, TargetSettings
+from .body import (
+    Integrator,
+    MaterialSettings,
+    PhysicsSettings,
+    SimulatorSettings,
+    SteppedSettings,
+    TargetSettings,
+)
 from .control import ControlSettings, Model
 from .data_kinds import MovingBase, RecordedData, ReleaseFromLoad, ReleaseFromTwist, SimulatedData
 from .learning import (
@@ -32,7 +39,10 @@ from .specimen import MaterialTestData
 
 Name = Annotated[
     str,
-    Field(pattern=r"^[\w-]+$", json_schema_extra={"wanted": "letters, digits, _ and - alone, as it names a folder"}),
+    Field(
+        pattern=r"^[\w-]+$",
+        json_schema_extra={"wanted": "letters, digits, _ and - alone, as it names a folder"},
+    ),
 ]
 
 DataSettings = Annotated[
@@ -46,7 +56,9 @@ class ParallelSettings(Settings):
 
     processes: Natural | None = setting(1, "number of processes; null: one for each core")
     address: Word | None = setting(
-        None, "address of a Dask cluster with the same folders, such as tcp://head:8786; null: this machine"
+        None,
+        "address of a Dask cluster with the same folders, "
+        "such as tcp://head:8786; null: this machine",
     )
     batch: Natural | None = setting(None, "trials that a process simulates at once; null: all")
 
@@ -65,12 +77,15 @@ class RunKeys(SimulatorSettings):
     name: Name = setting(description="name of the experiment and of the folder of its runs")
     title: Word = setting(description="title of the report")
     test_titles: Pair[Word] = setting(
-        ("loads as in training", "other loads"), "titles of the test trials, and of those of data.others"
+        ("loads as in training", "other loads"),
+        "titles of the test trials, and of those of data.others",
     )
-    seed: Annotated[int, Field(ge=0, lt=2**63, json_schema_extra={"wanted": "between 0 and 2^63 - 1"})] = setting(
-        0, "seed of all random numbers"
+    seed: Annotated[
+        int, Field(ge=0, lt=2**63, json_schema_extra={"wanted": "between 0 and 2^63 - 1"})
+    ] = setting(0, "seed of all random numbers")
+    tip: Place | None = setting(
+        None, "vertices whose mean motion is reported, where there are no markers"
     )
-    tip: Place | None = setting(None, "vertices whose mean motion is reported, where there are no markers")
     simulation: MaterialSettings = setting(description="material of the simulator to correct")
     target: TargetSettings | None = setting(
         None, "simulation that stands in for the real body where data are simulated"
@@ -87,34 +102,49 @@ class RunKeys(SimulatorSettings):
     )
     published: PublishedSettings | None = setting(None, "simulation to compare with")
     identify: IdentifySettings | None = setting(None, "physical parameters to identify; null: none")
-    law: Annotated[LawSettings | None, BeforeValidator(by_file, json_schema_input_type=LawSettings | str | None)] = (
-        setting(None, "law of the material to identify; null: none")
+    law: Annotated[
+        LawSettings | None,
+        BeforeValidator(by_file, json_schema_input_type=LawSettings | str | None),
+    ] = setting(None, "law of the material to identify; null: none")
+    actuator: ActuatorSettings | None = setting(
+        None, "learned changes of the inputs of actuators; null: none"
     )
-    actuator: ActuatorSettings | None = setting(None, "learned changes of the inputs of actuators; null: none")
     shapes: dict[str, ShapeSettings] = setting(
-        {}, "other bodies by name, on which the identified material is tested, where the real body is simulated"
+        {},
+        "other bodies by name, on which the identified material is tested, "
+        "where the real body is simulated",
     )
     reconstruction: ReconstructionSettings | None = setting(
         ReconstructionSettings(),
-        "forces that explain the trials; null: none, so that neither a force nor SimFree is learned",
+        "forces that explain the trials; null: none, "
+        "so that neither a force nor SimFree is learned",
     )
     network: NetworkSettings = NetworkSettings()
     trainer: TrainerSettings = TrainerSettings()
     simfree: BaselineSettings = BaselineSettings()
     in_the_loop: InTheLoopSettings | None = setting(
-        None, "training of the force on whole trials through the simulator; null: on reconstructed steps"
+        None,
+        "training of the force on whole trials through the simulator; null: on reconstructed steps",
     )
     actuation: ActuationSettings = ActuationSettings()
     release: ReleaseSettings = ReleaseSettings()
     control: ControlSettings | None = setting(None, "paths that the robot follows; null: none")
-    ablation: AblationSettings | None = setting(None, "study of the number of markers, in place of learning")
-    correct_uncorrected: bool = setting(False, "also learn a force for the simulator without identification")
+    ablation: AblationSettings | None = setting(
+        None, "study of the number of markers, in place of learning"
+    )
+    correct_uncorrected: bool = setting(
+        False, "also learn a force for the simulator without identification"
+    )
     force_frame: Literal["corotated", "world"] = setting(
-        "world", "corotated: residual forces rotate with the body; world: they keep their directions, as published"
+        "world",
+        "corotated: residual forces rotate with the body; world: "
+        "they keep their directions, as published",
     )
     range_guard: bool = setting(True, "limit the inputs of networks to their training range")
     mesh_check: Annotated[float, Field(gt=1.0, le=4.0)] | None = setting(
-        None, "refinement of a second mesh, whose short simulation shows the discretisation error; null: none"
+        None,
+        "refinement of a second mesh, whose short simulation shows the discretisation error; "
+        "null: none",
     )
     timing: bool = setting(True, "time the models, one trial at a time")
     parallel: ParallelSettings = ParallelSettings()
@@ -148,7 +178,10 @@ class RunKeys(SimulatorSettings):
             InputError: the run has pictures or tests of specimens.
         """
         if isinstance(self.data, PictureData | MaterialTestData):
-            raise InputError(f"data.kind is {self.data.kind}: it has no trials to show, to track or to learn from.")
+            raise InputError(
+                f"data.kind is {self.data.kind}: "
+                "it has no trials to show, to track or to learn from."
+            )
         return self.data
 
     @property
@@ -158,7 +191,10 @@ class RunKeys(SimulatorSettings):
 
     @property
     def targets(self) -> dict[str, TargetSettings]:
-        """The simulation that stands in for the real body, by key; empty if the data are recordings of a real body."""
+        """The simulation that stands in for the real body, by key.
+
+        Empty if the data are recordings of a real body.
+        """
         played = {"target": None if self.recorded is not None else self.target}
         played |= {"laboratory": self.laboratory if self.is_laboratory else None}
         return {key: settings for key, settings in played.items() if settings is not None}
@@ -233,7 +269,12 @@ class RunKeys(SimulatorSettings):
         """
         groups, key = (self, "") if model != "simfree" else (self.simfree, "simfree")
         in_the_loop = self.in_the_loop if model != "simfree" else None
-        values = {"network": groups.network, "trainer": groups.trainer, "in_the_loop": in_the_loop, "seed": self.seed}
+        values = {
+            "network": groups.network,
+            "trainer": groups.trainer,
+            "in_the_loop": in_the_loop,
+            "seed": self.seed,
+        }
         return parse(TrainingSettings, values, key)
 
     def motions(self) -> dict[str, MotionSettings]:
@@ -245,8 +286,14 @@ class RunKeys(SimulatorSettings):
             for name, motion in self.data.obstacle_motion.items()
             if isinstance(motion, MotionSettings)
         }
-        tables = {} if self.recorded is None or self.is_laboratory else {"data": self.recorded.trials}
-        tables |= {} if self.laboratory is None or not self.is_laboratory else {"laboratory": self.laboratory.trials}
+        tables = (
+            {} if self.recorded is None or self.is_laboratory else {"data": self.recorded.trials}
+        )
+        tables |= (
+            {}
+            if self.laboratory is None or not self.is_laboratory
+            else {"laboratory": self.laboratory.trials}
+        )
         for group, trials in tables.items():
             for name, trial in trials.items():
                 if trial.base_motion is not None:

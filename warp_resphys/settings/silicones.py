@@ -1,4 +1,6 @@
-"""Laws of silicones that come with the package, by name: ``scripts/silicone_laws.py`` writes most of them."""
+"""Laws of silicones that come with the package, by name:
+``scripts/silicone_laws.py`` writes most of them.
+"""
 
 import re
 from pathlib import Path
@@ -25,7 +27,10 @@ def silicone_name(product: str) -> str:
     """
     known = {_letters(name): name for name in silicone_files()}
     if (wanted := _letters(product)) not in known:
-        near = did_you_mean(product, [*known.values()]) or f": choose from {', '.join(known.values())}."
+        near = (
+            did_you_mean(product, [*known.values()])
+            or f": choose from {', '.join(known.values())}."
+        )
         raise ValueError(f"name is {product!r}, which has no law here{near}")
     return known[wanted]
 
@@ -35,7 +40,8 @@ def _letters(name: str) -> str:
 
 
 def silicone_values(values: dict[str, Any]) -> dict[str, Any]:
-    """Returns the values of a material whose model is ``silicone``, with the parameters of the law of its ``name``.
+    """Returns the values of a material whose model is ``silicone``,
+    with the parameters of the law of its ``name``.
 
     Raises:
         ValueError: there is no such silicone.
@@ -43,5 +49,7 @@ def silicone_values(values: dict[str, Any]) -> dict[str, Any]:
     if values.get("model") != SILICONE:
         return values
     law = read_json(silicone_files()[silicone_name(str(values.get("name", "")))])
-    parameters = {name: value for name, value in law["parameters"].items() if name not in _OF_ROBOTS}
+    parameters = {
+        name: value for name, value in law["parameters"].items() if name not in _OF_ROBOTS
+    }
     return {**parameters, **{k: x for k, x in values.items() if k != "name"}, "model": law["model"]}

@@ -1,7 +1,9 @@
-"""Settings of the stages of a run: a stage reads the keys of the run that the pipeline names for it, and no others.
+"""Settings of the stages of a run: a stage reads the keys of the run
+that the pipeline names for it, and no others.
 
-The fingerprint of a stage covers the content of these keys, and the values that the pipeline derives for it. A key that
-is not named raises an AttributeError, so that no dependency of a file is forgotten.
+The fingerprint of a stage covers the content of these keys, and the values that the pipeline
+derives for it. A key that is not named raises an AttributeError, so that no dependency of a file is
+forgotten.
 """
 
 from collections.abc import Iterable
@@ -39,7 +41,13 @@ def keys_of(group: str, settings: type[Settings]) -> tuple[str, ...]:
 
 SIMULATOR: Final = tuple(SimulatorSettings.model_fields)
 BATCH: Final = "parallel.batch"
-IMPORTED: Final = (*SIMULATOR, "simulation", "markers", "sensors", *keys_of("data", ReadingSettings))
+IMPORTED: Final = (
+    *SIMULATOR,
+    "simulation",
+    "markers",
+    "sensors",
+    *keys_of("data", ReadingSettings),
+)
 # Keys of a simulated laboratory.
 PLAYED: Final = (
     *("gravity", "time_step", "solver", "device", "seed", "tip", "sensors"),
@@ -65,17 +73,17 @@ class StageSettings(RunSettings):
     reads: Many[str]  # keys of the run; a dotted key leads to one key of a group
     files: dict[str, str] = setting({})  # SHA-256 of all files that are read, by path
     trials: Many[Trial] = setting(())
-    learned: Many[str] | None = setting(None)  # names of the trials of training and validation; None with folds
+    learned: Many[str] | None = setting(None)  # trials of training, validation; None with folds
     split: Split = setting(Split(train=(), validation=(), test=()))
     shared: str = setting("")  # folder of the dataset, from that of the split
     acquired: str = setting("")  # fingerprint of the stage that wrote the dataset
     model: str = setting("")
     reconstructed: Many[str] = setting(())  # names of the trials
     training: TrainingSettings = setting(None)
-    groups: dict[str, Many[str]] = setting({})  # names of the test trials by scale of the inputs, ``1`` first
+    groups: dict[str, Many[str]] = setting({})  # test trials by scale of the inputs, ``1`` first
     calibration: Many[str] = setting(())  # names of the trials that prediction intervals come from
     must_reach: bool = setting(False)  # whether the robot must be able to reach all figures
-    folds: dict[str, Any] = setting({})  # errors of the models of a cross-validation, by the left-out trial
+    folds: dict[str, Any] = setting({})  # errors of models in cross-validation, by left-out trial
     _whole: dict[str, Any] = PrivateAttr(default_factory=dict)  # all keys of the run
 
     if TYPE_CHECKING:  # A stage with a group is part of runs that have it.
@@ -94,7 +102,11 @@ class StageSettings(RunSettings):
     @model_validator(mode="after")
     def _lacks_others(self) -> Self:
         self._whole.update(self.__dict__)
-        derived = {name: value for name, value in self.__dict__.items() if name not in RunSettings.model_fields}
+        derived = {
+            name: value
+            for name, value in self.__dict__.items()
+            if name not in RunSettings.model_fields
+        }
         object.__setattr__(self, "__dict__", _part(self, self.reads) | derived)
         return self
 
@@ -111,22 +123,30 @@ class StageSettings(RunSettings):
 
     @override
     def plain(self) -> dict[str, Any]:
-        """Returns nested data of JSON types with all keys of the run, from which `parse` makes this object again."""
+        """Returns nested data of JSON types with all keys of the run,
+        from which `parse` makes this object again.
+        """
         whole = self.model_copy()
         object.__setattr__(whole, "__dict__", self._whole)
-        absent = type(self).model_fields.keys() - self.model_fields_set - RunSettings.model_fields.keys()
+        absent = (
+            type(self).model_fields.keys() - self.model_fields_set - RunSettings.model_fields.keys()
+        )
         return whole.model_dump(mode="json", by_alias=True, exclude=absent)
 
     @override
     def content(self) -> Any:
         derived = self.model_fields_set - RunSettings.model_fields.keys() - {"reads"}
-        values = {name: value for name, value in self.__dict__.items() if name in RunSettings.model_fields}
+        values = {
+            name: value for name, value in self.__dict__.items() if name in RunSettings.model_fields
+        }
         values |= {name: self.__dict__[name] for name in derived}
         return {name: _content(value) for name, value in values.items()}
 
 
 def _part(group: Settings, keys: Iterable[str]) -> dict[str, Any]:
-    """Returns the values of some keys of a group by name; a dotted key leads to one key of a group in it.
+    """Returns the values of some keys of a group by name.
+
+    A dotted key leads to one key of a group in it.
 
     Names that the group lacks are left out, as it may be of another kind.
     """
@@ -136,7 +156,9 @@ def _part(group: Settings, keys: Iterable[str]) -> dict[str, Any]:
         below.setdefault(name, []).append(rest)
     values = {name: getattr(group, name) for name in below if name in type(group).model_fields}
     return {
-        name: _only(value, below[name]) if "" not in below[name] and isinstance(value, Settings) else value
+        name: _only(value, below[name])
+        if "" not in below[name] and isinstance(value, Settings)
+        else value
         for name, value in values.items()
     }
 

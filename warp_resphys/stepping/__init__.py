@@ -1,1 +1,3 @@
-"""States, inputs, constants, quantities and time integrators, which the energies and the simulator share."""
+"""States, inputs, constants, quantities and time integrators,
+which the energies and the simulator share.
+"""

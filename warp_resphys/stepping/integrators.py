@@ -1,8 +1,9 @@
-"""Time integrators, each written as an implicit Euler step with its own step length and starting point.
+"""Time integrators, each written as an implicit Euler step
+with its own step length and starting point.
 
-Every step minimises the incremental potential with effective step ``h_e``, inertial target y and strain-rate reference
-r, and computes the new state from the minimiser x. Both parts are linear in the states, so the gradients of a method
-follow from those of the nonlinear solve.
+Every step minimises the incremental potential with effective step ``h_e``, inertial target y and
+strain-rate reference r, and computes the new state from the minimiser x. Both parts are linear in
+the states, so the gradients of a method follow from those of the nonlinear solve.
 """
 
 from abc import ABC, abstractmethod
@@ -26,7 +27,7 @@ class Integrator(ABC):
         """Returns the new state from the solution x (B, N, 3) of the stage."""
 
     def solution_for(self, state: State, q: torch.Tensor) -> torch.Tensor:
-        """Returns the solution x of the stage for which `finish` gives the positions q (B, N, 3)."""
+        """Returns the solution x of the stage for which `finish` gives positions q (B, N, 3)."""
         del state
         return q
 
@@ -46,7 +47,8 @@ class ImplicitEuler(Integrator):
 class BDF2(Integrator):
     """Second order, damps motions that the step does not resolve; the first step is implicit Euler.
 
-    q+ = (4 q - q') / 3 + 2h/3 v+, likewise for v+ (Hairer and Wanner 1996, section V.1); q' is one step earlier.
+    q+ = (4 q - q') / 3 + 2h/3 v+, likewise for v+ (Hairer and Wanner 1996, section V.1); q' is one
+    step earlier.
     """
 
     @override
@@ -70,12 +72,14 @@ class BDF2(Integrator):
 class Midpoint(Integrator):
     """Implicit midpoint: second order, conserves the energy of small vibrations.
 
-    An implicit Euler step of h/2, then an explicit one: q+ = 2 x - q, v+ = 4 (x - q) / h - v. Vibrations with periods
-    of few steps persist unless the material is damped.
+    An implicit Euler step of h/2, then an explicit one: q+ = 2 x - q, v+ = 4 (x - q) / h - v.
+    Vibrations with periods of few steps persist unless the material is damped.
 
-    The strain rate is needed at the end x of the half step, but (E(x) - E(q)) / (h/2) is the rate at its middle: with
-    L = grad v it lacks h/4 L^T L, as E is quadratic. Since E(q + s v) + E(q - s v) - 2 E(q) = s^2 L^T L, the reference
-    2 E(q) - (E(q + s v) + E(q - s v)) / 2 with s = h/2 corrects this, and rigid rotations stay undamped.
+    The strain rate is needed at the end x of the half step, but (E(x) - E(q)) / (h/2) is the rate
+    at its middle: with L = grad v it lacks h/4 L^T L, as E is quadratic. Since
+    E(q + s v) + E(q - s v) - 2 E(q) = s^2 L^T L, the reference
+    2 E(q) - (E(q + s v) + E(q - s v)) / 2 with s = h/2 corrects this, and rigid rotations stay
+    undamped.
     """
 
     @override
@@ -94,7 +98,11 @@ class Midpoint(Integrator):
         return State(2.0 * x - state.q, 2.0 * half - state.v)
 
 
-INTEGRATORS: dict[str, type[Integrator]] = {"implicit_euler": ImplicitEuler, "bdf2": BDF2, "midpoint": Midpoint}
+INTEGRATORS: dict[str, type[Integrator]] = {
+    "implicit_euler": ImplicitEuler,
+    "bdf2": BDF2,
+    "midpoint": Midpoint,
+}
 
 
 def make_integrator(name: str) -> Integrator:

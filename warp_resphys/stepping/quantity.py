@@ -22,8 +22,8 @@ class Quantity:
     lower: float = -np.inf  # exclusive lower bound, inclusive if `closed`
     upper: float = np.inf  # exclusive upper bound
     closed: bool = False  # whether `lower` itself is allowed
-    per: str = ""  # ``element``, ``chamber`` and the like, if there may be one value for each; empty: one per body
-    shape: tuple[int, ...] = ()  # shape of an array-valued quantity, such as a direction; excludes `per`
+    per: str = ""  # ``element``, ``chamber`` and the like, with a value for each; empty: per body
+    shape: tuple[int, ...] = ()  # of an array-valued quantity, such as a direction; excludes `per`
     typical: float = 1.0  # order of magnitude of an input, or of a parameter without bounds
     words: str = ""  # name of an input in a sentence
     shown_unit: str = ""  # unit of displayed values
@@ -31,7 +31,10 @@ class Quantity:
 
     def __float__(self) -> float:
         """Raises InputError, as a quantity is no number."""
-        raise InputError(f"{self.name} is declared here, with its unit and range: its value is in `defaults`, by name.")
+        raise InputError(
+            f"{self.name} is declared here, with its unit and range: "
+            "its value is in `defaults`, by name."
+        )
 
     def shown(self, value: float) -> str:
         """Returns a value as text, in the displayed unit."""
@@ -55,7 +58,8 @@ class Quantity:
     def varied(self, value: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
         """Returns a value within the range for every x, and `value` itself for x = 0.
 
-        Near x = 0 a bounded value changes by the factor exp(x), an unbounded one by x times its size or `typical`.
+        Near x = 0 a bounded value changes by the factor exp(x), an unbounded one by x times its
+        size or `typical`.
         """
         if np.isfinite(self.lower) and np.isfinite(self.upper):
             width = self.upper - self.lower
@@ -65,28 +69,40 @@ class Quantity:
         return value + value.abs().amax().clamp_min(self.typical) * x
 
     def check(self, value: Any) -> None:
-        """Raises InputError unless a value is a number or an array of numbers, all within the range."""
+        """Raises InputError unless a value is a number
+        or an array of numbers, all within the range.
+        """
         try:
             values = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
         except (TypeError, ValueError, RuntimeError):
-            raise InputError(f"{self.name} is {value!r}: it must be a number, {self.valid_range}.") from None
-        inside = (values >= self.lower if self.closed else values > self.lower) & (values < self.upper)
-        inside &= torch.isfinite(values)
-        if self.shape and tuple(values.shape) != self.shape and tuple(values.shape[1:]) != self.shape:
             raise InputError(
-                f"{self.name} has shape {tuple(values.shape)}: it must be {self.shape}, or (B, *{self.shape}) with one "
-                "for each environment."
+                f"{self.name} is {value!r}: it must be a number, {self.valid_range}."
+            ) from None
+        inside = (values >= self.lower if self.closed else values > self.lower) & (
+            values < self.upper
+        )
+        inside &= torch.isfinite(values)
+        if (
+            self.shape
+            and tuple(values.shape) != self.shape
+            and tuple(values.shape[1:]) != self.shape
+        ):
+            raise InputError(
+                f"{self.name} has shape {tuple(values.shape)}: it must be {self.shape}, or (B, "
+                f"*{self.shape}) with one for each environment."
             )
         if not self.shape and (values.numel() == 0 or values.ndim > 2):
             raise InputError(
-                f"{self.name} has shape {tuple(values.shape)}: give a number, (M,), (B, 1) or (B, M) values."
+                f"{self.name} has shape {tuple(values.shape)}: "
+                "give a number, (M,), (B, 1) or (B, M) values."
             )
         if not bool(inside.all()):
             wrong = values[~inside].flatten()[0].item()
             raise InputError(f"{self.name} is {wrong:g}: it must be {self.valid_range}.")
 
     def shaped(self, values: torch.Tensor) -> torch.Tensor:
-        """Returns a number, (n,), (B, 1) or (B, n) values as (1 or B, 1 or n), an array as (1 or B, *shape).
+        """Returns a number, (n,), (B, 1) or (B, n) values as (1 or B, 1 or n),
+        an array as (1 or B, *shape).
 
         Keeps the autograd graph.
         """
@@ -97,7 +113,9 @@ class Quantity:
         return values.reshape(1, -1) if values.ndim < 2 else values
 
 
-def parameter(default: Any, name: str, unit: str, lower: float = 0.0, *, kw_only: bool = False, **more: Any) -> Any:
+def parameter(
+    default: Any, name: str, unit: str, lower: float = 0.0, *, kw_only: bool = False, **more: Any
+) -> Any:
     """Returns a field of a dataclass that holds the value of a parameter.
 
     Args:
@@ -108,10 +126,16 @@ def parameter(default: Any, name: str, unit: str, lower: float = 0.0, *, kw_only
         kw_only: whether the argument is keyword-only.
         more: other fields of the quantity.
     """
-    return field(default=default, kw_only=kw_only, metadata={"quantity": Quantity(name, unit, lower, **more)})
+    return field(
+        default=default, kw_only=kw_only, metadata={"quantity": Quantity(name, unit, lower, **more)}
+    )
 
 
 def quantities_of(kind: Any) -> dict[str, Quantity]:
     """Returns the quantities of a class's fields that are made by `parameter`, by field."""
     known = getattr(kind, "__dataclass_fields__", {})
-    return {name: item.metadata["quantity"] for name, item in known.items() if "quantity" in item.metadata}
+    return {
+        name: item.metadata["quantity"]
+        for name, item in known.items()
+        if "quantity" in item.metadata
+    }

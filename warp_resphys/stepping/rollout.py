@@ -1,9 +1,9 @@
 """The roll-out of everything that moves step by step.
 
-A stepper is a function (state, inputs of a step) -> next state: the ``step`` of a simulator, a corrected simulator, a
-robot, a scene, a reduced model or a world. All that a step depends on is in the state and the inputs, so that a
-roll-out is differentiable, and continues from any of its states. Where a step depends on its number, its inputs are
-that number.
+A stepper is a function (state, inputs of a step) -> next state: the ``step`` of a simulator, a
+corrected simulator, a robot, a scene, a reduced model or a world. All that a step depends on is in
+the state and the inputs, so that a roll-out is differentiable, and continues from any of its
+states. Where a step depends on its number, its inputs are that number.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -30,13 +30,17 @@ def states(step: Stepper[S, I], state: S, inputs: Iterable[I]) -> Iterator[S]:
     return accumulate(inputs, step, initial=state)
 
 
-def rollout(step: Stepper[S, I], state: S, inputs: Iterable[I], observe: Callable[[S], O]) -> list[O]:
-    """Simulates T steps and returns T + 1 observations: of the initial state, and of the state after every step.
+def rollout(
+    step: Stepper[S, I], state: S, inputs: Iterable[I], observe: Callable[[S], O]
+) -> list[O]:
+    """Simulates T steps and returns T + 1 observations:
+    of the initial state, and of the state after every step.
 
     Args:
         step: the stepper.
         state: initial state.
-        inputs: inputs of the T steps, in turn, such as `Inputs.by_step`, or ``range(T)`` for their numbers.
+        inputs: inputs of the T steps, in turn, such as `Inputs.by_step`, or ``range(T)`` for their
+            numbers.
         observe: what is kept of a state.
     """
     return [observe(now) for now in states(step, state, inputs)]
@@ -49,10 +53,12 @@ def on_steps(times: torch.Tensor, step: float) -> bool:
 
 
 def sample(series: torch.Tensor, times: torch.Tensor, step: float) -> torch.Tensor:
-    """(B, T, ...) values at the given times, by cubic Hermite interpolation with central differences as slopes.
+    """(B, T, ...) values at the given times, by cubic Hermite interpolation
+    with central differences as slopes.
 
     Args:
-        series: (B, K + 1, ...) values at the times 0, h, ..., K h, with K at least 2 if a time is between them.
+        series: (B, K + 1, ...) values at the times 0, h, ..., K h, with K at least 2 if a time is
+            between them.
         times: (B, T) [s], from zero; beyond the end the last value stays.
         step: h [s].
     """
@@ -64,7 +70,10 @@ def sample(series: torch.Tensor, times: torch.Tensor, step: float) -> torch.Tens
     slopes = torch.gradient(series, dim=1, edge_order=2)[0]
     index = position.floor().long().clamp(max=last - 1)
     s = (position - index).reshape(*times.shape, *[1] * (series.ndim - 2))
-    a, b, da, db = series[batch, index], series[batch, index + 1], slopes[batch, index], slopes[batch, index + 1]
+    a = series[batch, index]
+    b = series[batch, index + 1]
+    da = slopes[batch, index]
+    db = slopes[batch, index + 1]
     return (
         (1.0 + 2.0 * s) * (1.0 - s) ** 2 * a
         + s * (1.0 - s) ** 2 * da

@@ -1,7 +1,9 @@
-"""Checks a device in two minutes: motions beside those on a CPU, gradients beside differences, and the time of a step.
+"""Checks a device in two minutes: motions beside those on a CPU,
+gradients beside differences, and the time of a step.
 
-The motions are those of Newton's method with LAPACK's banded factors on the CPU, whose mean heights at the end are also
-stored here. Other solvers, precisions and batches on the device must give the same.
+The motions are those of Newton's method with LAPACK's banded factors on the CPU, whose mean heights
+at the end are also stored here. Other solvers, precisions and batches on the device must give the
+same.
 """
 
 import time
@@ -50,7 +52,11 @@ POSITION_BOUND: Final = {torch.float64: 1e-8, torch.float32: 1e-5}  # m
 GRADIENT_BOUND: Final = 1e-6  # relative
 _TOLERANCE: Final = {torch.float64: 1e-9, torch.float32: 1e-5}  # of the solvers that are compared
 _MATERIAL: Final = Corotated(
-    youngs_modulus=2.64e5, poissons_ratio=0.45, density=1070.0, mass_damping=0.5, stiffness_damping=2e-3
+    youngs_modulus=2.64e5,
+    poissons_ratio=0.45,
+    density=1070.0,
+    mass_damping=0.5,
+    stiffness_damping=2e-3,
 )
 
 
@@ -75,11 +81,14 @@ class Gradients(NamedTuple):
     simulator: Callable[..., Simulator]
     start: str
     change: float = 1.0
-    of: tuple[str, ...] = ()  # how the names of the parameters begin, besides q and v; empty for all and the inputs
+    of: tuple[str, ...] = ()  # how parameters begin, besides q and v; empty for all, and the inputs
 
 
 def check(settings: CheckSettings, folder: Path) -> None:
-    """Prints the checks and the times of a step; exits with 1 where a check failed, and refuses an unknown device."""
+    """Prints the checks and the times of a step.
+
+    Exits with 1 where a check failed, and refuses an unknown device.
+    """
     wp.config.log_level = wp.LOG_WARNING
     device, began = choose_device(settings.device), time.perf_counter()
     if device.type == "cpu":
@@ -90,20 +99,34 @@ def check(settings: CheckSettings, folder: Path) -> None:
             checks += motion_checks(name, device)
             progress.advance()
         for name in GRADIENTS:
-            checks.append(bounded(f"{name}, gradients", partial(gradient_error, name, device), GRADIENT_BOUND))
+            checks.append(
+                bounded(f"{name}, gradients", partial(gradient_error, name, device), GRADIENT_BOUND)
+            )
             progress.advance()
-    rows = [[one.name, one.result, one.allowed, "passed" if one.passed else "FAILED"] for one in checks]
+    rows = [
+        [one.name, one.result, one.allowed, "passed" if one.passed else "FAILED"] for one in checks
+    ]
     failed = [one for one in checks if not one.passed]
     place = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU"
-    show(PageTable.plain(f"Largest errors on {place}", ["check", "error", "allowed", ""], rows), speed_table(device))
-    outcome = f"{len(failed)} of {len(rows)} checks failed" if failed else f"All {len(rows)} checks passed"
+    show(
+        PageTable.plain(f"Largest errors on {place}", ["check", "error", "allowed", ""], rows),
+        speed_table(device),
+    )
+    outcome = (
+        f"{len(failed)} of {len(rows)} checks failed"
+        if failed
+        else f"All {len(rows)} checks passed"
+    )
     show(f"{outcome}, in {time.perf_counter() - began:.0f} s.")
     if failed:
         raise SystemExit(1)
 
 
 def bounded(name: str, measure: Callable[[], float], bound: float, unit: str = "") -> Check:
-    """Compares a figure with the bound that it must not exceed; an error on the way is a failure."""
+    """Compares a figure with the bound that it must not exceed.
+
+    An error on the way is a failure.
+    """
     try:
         figure = measure()
     except (ResphysError, RuntimeError) as error:
@@ -112,11 +135,18 @@ def bounded(name: str, measure: Callable[[], float], bound: float, unit: str = "
 
 
 def motion_checks(name: str, device: torch.device) -> Iterator[Check]:
-    """Compares a motion on a device, by solver and precision, and alone in its batch, with that on the CPU."""
+    """Compares a motion on a device, by solver and precision,
+    and alone in its batch, with that on the CPU.
+    """
     build, height = MOTIONS[name]
     exact = SolverSettings(name="newton", relative_tolerance=1e-11, linear_solver="banded")
     reference, most = positions(build(solver=exact)), POSITION_BOUND[torch.float64]
-    yield bounded(f"{name}, height on the CPU", lambda: abs(float(reference[-1, ..., 2].mean()) - height), most, "m")
+    yield bounded(
+        f"{name}, height on the CPU",
+        lambda: abs(float(reference[-1, ..., 2].mean()) - height),
+        most,
+        "m",
+    )
 
     def error(environments: slice, **options: Any) -> float:
         moved = positions(build(device=device, **options), environments)
@@ -125,13 +155,21 @@ def motion_checks(name: str, device: torch.device) -> Iterator[Check]:
     # On a GPU, the banded solver is the tiled one.
     absent = ("pardiso",) * (not has_pardiso()) if device.type == "cpu" else ("tiled", "pardiso")
     solvers: list[LinearSolverName] = [linear for linear in LINEAR_SOLVERS if linear not in absent]
-    cases: list[tuple[SolverName, LinearSolverName, torch.dtype]] = [("newton", "auto", torch.float64)]
+    cases: list[tuple[SolverName, LinearSolverName, torch.dtype]] = [
+        ("newton", "auto", torch.float64)
+    ]
     cases += [("quasi_newton", "auto", torch.float32)]
-    cases += [("quasi_newton", linear, torch.float64) for linear in (solvers if name in EVERY_SOLVER else solvers[:1])]
+    cases += [
+        ("quasi_newton", linear, torch.float64)
+        for linear in (solvers if name in EVERY_SOLVER else solvers[:1])
+    ]
     cases += [("projective_dynamics", "auto", torch.float64)] * (name == "hexahedra")
     for solver, linear, dtype in cases:
         settings = SolverSettings(
-            name=solver, relative_tolerance=_TOLERANCE[dtype], max_iterations=100_000, linear_solver=linear
+            name=solver,
+            relative_tolerance=_TOLERANCE[dtype],
+            max_iterations=100_000,
+            linear_solver=linear,
         )
         measure = partial(error, slice(None), solver=settings, dtype=dtype)
         title = f"{name}, {solver}, {linear}, {str(dtype).removeprefix('torch.')}"
@@ -142,45 +180,70 @@ def motion_checks(name: str, device: torch.device) -> Iterator[Check]:
 
 @torch.no_grad()
 def positions(simulator: Simulator, environments: slice = slice(None)) -> torch.Tensor:
-    """Positions (STEPS + 1, B, N, 3) of chosen environments, which differ in start and inputs, on the CPU [m].
+    """Positions (STEPS + 1, B, N, 3) of chosen environments,
+    which differ in start and inputs, on the CPU [m].
 
     They begin bent, where that is free of contact, or at rest with a speed. Inputs rise from zero.
     """
     rest, share = simulator.rest_state(BATCH), simulator.tensor(np.linspace(0.0, 1.0, BATCH))
     speed = share[:, None, None] * simulator.tensor([0.0, 0.1, -0.05])
     moving = State(rest.q, (speed * torch.ones_like(rest.v)).index_fill(1, simulator.fixed, 0.0))
-    start = moving if simulator.inputs or isinstance(simulator.body, Scene) else pose(simulator, "bent", BATCH)
-    rise = simulator.tensor(np.arange(1, 1 + STEPS) / STEPS)[:, None, None] * (0.3 + share[environments, None])
-    levels = {name: rise * simulator.tensor(level) for name, level in LEVELS.items() if name in simulator.inputs}
+    start = (
+        moving
+        if simulator.inputs or isinstance(simulator.body, Scene)
+        else pose(simulator, "bent", BATCH)
+    )
+    rise = simulator.tensor(np.arange(1, 1 + STEPS) / STEPS)[:, None, None] * (
+        0.3 + share[environments, None]
+    )
+    levels = {
+        name: rise * simulator.tensor(level)
+        for name, level in LEVELS.items()
+        if name in simulator.inputs
+    }
     state = State(start.q[environments], start.v[environments])
     return simulator.rollout(state, STEPS, Inputs(**levels)).q.cpu().double()
 
 
 def gradient_error(name: str, device: torch.device) -> float:
-    """Largest relative error of the adjoints of two steps on a device, beside central differences."""
+    """Largest relative error of adjoints of two steps on a device, beside central differences."""
     gradients = GRADIENTS[name]
-    simulator = gradients.simulator(solver=SolverSettings(name="newton", relative_tolerance=1e-12), device=device)
-    names = (
-        {"q", "v", *(name for name in simulator.parameters if name.startswith(gradients.of))} if gradients.of else None
+    simulator = gradients.simulator(
+        solver=SolverSettings(name="newton", relative_tolerance=1e-12), device=device
     )
-    rows = check_gradients(simulator, gradients.start, steps=2, change=gradients.change, names=names)
+    names = (
+        {"q", "v", *(name for name in simulator.parameters if name.startswith(gradients.of))}
+        if gradients.of
+        else None
+    )
+    rows = check_gradients(
+        simulator, gradients.start, steps=2, change=gradients.change, names=names
+    )
     return max(row.relative_error for row in rows)
 
 
 def speed_table(device: torch.device) -> PageTable:
-    """Milliseconds of a step of a batch of beams and of its gradient, on the CPU and on the device beside it."""
+    """Milliseconds of a step of a batch of beams and of its gradient,
+    on the CPU and on the device beside it.
+    """
     devices = dict.fromkeys((torch.device("cpu"), device))
     rows = []
     for batch in _TIMED:
-        for what, *figures in zip(("step", "gradient"), *(milliseconds(one, batch) for one in devices), strict=True):
+        for what, *figures in zip(
+            ("step", "gradient"), *(milliseconds(one, batch) for one in devices), strict=True
+        ):
             faster = [f"{figures[0] / figure:.1f}" for figure in figures[1:]]
             rows.append([f"{what} of {batch}", *(f"{figure:.2f}" for figure in figures), *faster])
     columns = [str(one) for one in devices] + ["times as fast"] * (len(devices) - 1)
-    return PageTable.plain("Milliseconds of beams of 480 unknowns, all together", ["", *columns], rows)
+    return PageTable.plain(
+        "Milliseconds of beams of 480 unknowns, all together", ["", *columns], rows
+    )
 
 
 def milliseconds(device: torch.device, batch: int) -> tuple[float, float]:
-    """Milliseconds of a step that keeps what its gradient needs, and of the gradient, after a first roll-out."""
+    """Milliseconds of a step that keeps what its gradient needs,
+    and of the gradient, after a first roll-out.
+    """
     simulator = beam(box_hexahedra(SIZE, (10, 3, 3)), device=device)
     start, moments = pose(simulator, "bent", batch), list[float]()
 
@@ -210,11 +273,17 @@ def between_obstacles(moves: bool, **options: Any) -> Simulator:
     """A beam between a bar, a plate and a ball on a grid, on which its weight makes it slide."""
     ball = trimesh.creation.icosphere(radius=0.01)
     obstacles = {
-        "bar": Cylinder(position=(0.05, 0.015, -0.0106), axis=(0.0, 1.0, 0.0), radius=0.01, length=0.06),
+        "bar": Cylinder(
+            position=(0.05, 0.015, -0.0106), axis=(0.0, 1.0, 0.0), radius=0.01, length=0.06
+        ),
         "plate": Box(position=(0.09, 0.015, -0.0107), edges=(0.04, 0.04, 0.02), moves=moves),
-        "ball": DistanceGrid.of_surface(ball.vertices, ball.faces, 1e-3, position=(0.067, 0.0163, 0.0407)),
+        "ball": DistanceGrid.of_surface(
+            ball.vertices, ball.faces, 1e-3, position=(0.067, 0.0163, 0.0407)
+        ),
     }
-    contact = Contact(obstacles, stiffness=1e5, friction={"bar": 0.3, "plate": 0.6, "ball": 0.2}, slip_speed=2e-2)
+    contact = Contact(
+        obstacles, stiffness=1e5, friction={"bar": 0.3, "plate": 0.6, "ball": 0.2}, slip_speed=2e-2
+    )
     return beam(box_hexahedra(SIZE, (6, 2, 2)), [contact], gravity=(1.0, 4.0, -9.0), **options)
 
 
@@ -222,7 +291,10 @@ def beam_on_beam(**options: Any) -> Simulator:
     """A beam that its weight presses on a thicker one and along it, with friction."""
     upper, lower = (box_hexahedra((0.1, 0.03, z), (4, 1, 1)) for z in (0.03, 0.05))
     below = replace(lower, vertices=lower.vertices + [0.0013, 0.0017, -0.0507])
-    bodies = {"upper": Body(upper, select_vertices(upper, x=0.0)), "lower": Body(below, select_vertices(lower, x=0.0))}
+    bodies = {
+        "upper": Body(upper, select_vertices(upper, x=0.0)),
+        "lower": Body(below, select_vertices(lower, x=0.0)),
+    }
     scene = Scene(bodies, SurfaceContact(stiffness=1e5, friction=0.3, slip_speed=2e-2))
     return Simulator(scene, _MATERIAL, 0.01, (1.0, 4.0, -9.0), **options)
 
@@ -233,24 +305,37 @@ def actuated(**options: Any) -> Simulator:
     outer = np.abs(box.vertices[box.cells].mean(1) / SIZE - 0.5).max(1) > 0.3
     chambers = find_chambers(mesh := Mesh(box.vertices, box.cells[outer]))
     tendons = Tendons([np.linspace([0.0, y, 0.03], [0.1, y, 0.03], 7) for y in (0.01, 0.02)], 50.0)
-    return beam(mesh, [Pressure(chambers), Fibres(chambers, (20.0, -20.0), stiffness=2e3), tendons], **options)
+    return beam(
+        mesh,
+        [Pressure(chambers), Fibres(chambers, (20.0, -20.0), stiffness=2e3), tendons],
+        **options,
+    )
 
 
 HEXAHEDRA: Final = partial(beam, box_hexahedra(SIZE, (6, 2, 2)), poissons_ratio=0.499)
 TETRAHEDRA: Final = partial(beam, box_tetrahedra(SIZE, (4, 1, 1), order=2))
-LEVELS: Final = {"pressure": [6e3], "tendon_tension": [0.6, 0.2], "obstacle_move_z": [0.0, 1e-3, 0.0]}  # at the end
+# At the end.
+LEVELS: Final = {
+    "pressure": [6e3],
+    "tendon_tension": [0.6, 0.2],
+    "obstacle_move_z": [0.0, 1e-3, 0.0],
+}
 EVERY_SOLVER: Final = ("hexahedra", "obstacles")  # motions with all linear solvers
-MOTIONS: Final[Mapping[str, tuple[Callable[..., Simulator], float]]] = {  # and mean heights at the end [m]
+# And mean heights at the end [m].
+MOTIONS: Final[Mapping[str, tuple[Callable[..., Simulator], float]]] = {
     "hexahedra": (HEXAHEDRA, 0.012234381155),
     "quadratic tetrahedra": (TETRAHEDRA, 0.011349058659),
     "obstacles": (partial(between_obstacles, moves=True), 0.015409707818),
     "two beams": (beam_on_beam, -0.006969349230),
     "actuators": (actuated, 0.012531685680),
 }
-GRADIENTS: Final[Mapping[str, Gradients]] = {  # by small changes where contact, fibres and tendons begin to pull
+# By small changes where contact, fibres and tendons begin to pull.
+GRADIENTS: Final[Mapping[str, Gradients]] = {
     "hexahedra at rest": Gradients(HEXAHEDRA, "rest"),
     "twisted hexahedra": Gradients(HEXAHEDRA, "twisted"),
-    "obstacles": Gradients(partial(between_obstacles, moves=False), "rest", 1e-3, ("contact_", "obstacle_")),
+    "obstacles": Gradients(
+        partial(between_obstacles, moves=False), "rest", 1e-3, ("contact_", "obstacle_")
+    ),
     "two beams": Gradients(beam_on_beam, "rest", 1e-3, ("surface_",)),
     "actuators": Gradients(actuated, "bent", 1e-2),
 }

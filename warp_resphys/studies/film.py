@@ -1,4 +1,6 @@
-"""The command `view film`: films of a trial with models of a run, or of the laboratory as controllers drove it."""
+"""The command `view film`: films of a trial with models of a run,
+or of the laboratory as controllers drove it.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +18,13 @@ from ..io.resuming import finished_record
 from ..io.safe_files import read_json
 from ..io.settings import Many, Positive, Settings, Word, setting
 from ..learning.baselines import BASELINES
-from ..report.body_motions import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion, hangs
+from ..report.body_motions import (
+    LABORATORY_MARKERS,
+    MEASURED_MARKERS,
+    TARGET_VERTICES,
+    ComparedMotion,
+    hangs,
+)
 from ..report.data import at_times, spread
 from ..report.layers import RenderScene
 from ..report.render import DrawingError, write_film
@@ -24,7 +32,8 @@ from ..report.wording import MODELS, compared_controllers, shown_models
 from ..robot.loading import load, recorded_trial
 from ..robot.robot import Robot
 
-_PLAYED: Final = {"simulate": TARGET_VERTICES, "laboratory": LABORATORY_MARKERS}  # by the stage that simulates them
+# By the stage that simulates them.
+_PLAYED: Final = {"simulate": TARGET_VERTICES, "laboratory": LABORATORY_MARKERS}
 _MOST_VIEWS: Final = 3  # of controllers, side by side
 _MOST_MARKERS: Final = 6  # vertices of the tip that are shown where every vertex is observed
 _AT_THE_TIP: Final = 0.97  # distance of these from the fixed vertices, over the largest
@@ -49,7 +58,8 @@ def film(settings: FilmSettings, folder: Path) -> None:
     It is written into the run folder, or to ``file``.
 
     Raises:
-        InputError: an unknown trial, model, motion or controller, a pose for a trial, or a machine that cannot draw.
+        InputError: an unknown trial, model, motion or controller, a pose for a trial, or a machine
+            that cannot draw.
         DataFileError: there is no finished run, or the film cannot be written.
     """
     del folder
@@ -59,7 +69,9 @@ def film(settings: FilmSettings, folder: Path) -> None:
         name, scene = _film_of_trial(run, settings)
     else:
         name, scene = _film_of_motion(run, settings.motion, settings)
-    path = run / "films" / f"{name}.mp4" if settings.file is None else Path(settings.file).expanduser()
+    path = (
+        run / "films" / f"{name}.mp4" if settings.file is None else Path(settings.file).expanduser()
+    )
     try:
         write_film(path, scene)
     except DrawingError as error:
@@ -75,7 +87,10 @@ def _film_of_trial(run: Path, settings: FilmSettings) -> tuple[str, RenderScene]
     metrics, models, seconds = read_json(run / METRICS), settings.models, settings.seconds
     if models is None:
         available = tuple(model for model in metrics["errors_mm"] if model not in BASELINES)
-        models = tuple(shown_models(metrics["errors_mm"], metrics.get("recommended", ""))) or available[:2]
+        models = (
+            tuple(shown_models(metrics["errors_mm"], metrics.get("recommended", "")))
+            or available[:2]
+        )
     name = metrics["per_trajectory"][0]["name"] if settings.trial is None else settings.trial
     motion = motion_of(run, name, models, np.inf if seconds is None else seconds)
     return name, motion.film(seconds, settings.slower)
@@ -85,17 +100,27 @@ def _film_of_motion(run: Path, name: str, settings: FilmSettings) -> tuple[str, 
     """Name and film of a motion that controllers drove."""
     for key in ("trial", "models"):
         if getattr(settings, key) is not None:
-            raise InputError(f"{key} is for films of trials, and motion for films of control: leave one of them out.")
-    seconds, controllers, control = settings.seconds, settings.controllers, driven_settings(run).control
+            raise InputError(
+                f"{key} is for films of trials, "
+                "and motion for films of control: leave one of them out."
+            )
+    seconds = settings.seconds
+    controllers = settings.controllers
+    control = driven_settings(run).control
     if controllers is None:
         controllers = tuple(name for name in compared_controllers(control) if name.startswith(OPEN))
     if len(controllers) > _MOST_VIEWS:
-        raise InputError(f"controllers names {len(controllers)}: a film shows at most {_MOST_VIEWS} side by side.")
+        raise InputError(
+            f"controllers names {len(controllers)}: "
+            f"a film shows at most {_MOST_VIEWS} side by side."
+        )
     played = replay(run, name, controllers, np.inf if seconds is None else seconds)
     return name, played.film(1.0 if settings.slower is None else settings.slower)
 
 
-def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.inf) -> ComparedMotion:
+def motion_of(
+    run: Path, trial: str, models: Sequence[str], seconds: float = np.inf
+) -> ComparedMotion:
     """Returns the first seconds of a trial, as measured and as simulated with models of a run.
 
     Raises:
@@ -105,34 +130,54 @@ def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.
     known = [name for name in MODELS if name not in BASELINES]
     unknown = [name for name in models if name not in known]
     if unknown or not models:
-        raise InputError(f"models names {unknown[0] if unknown else 'none'}: choose some of {', '.join(known)}.")
+        raise InputError(
+            f"models names {unknown[0] if unknown else 'none'}: choose some of {', '.join(known)}."
+        )
     positions, markers = {}, {}
     for model in models:
         robot = load(run, model)
         played = recorded_trial(robot, trial)
         if not played.steps:
-            raise InputError(f"the trial {trial} is a pose, which cannot be filmed: choose a motion.")
+            raise InputError(
+                f"the trial {trial} is a pose, which cannot be filmed: choose a motion."
+            )
         with torch.no_grad():
             whole = played.play(robot)
-        frames = np.flatnonzero((np.diff(played.times, prepend=-1.0) > 0.0) & (played.times <= seconds + 1e-9))
+        frames = np.flatnonzero(
+            (np.diff(played.times, prepend=-1.0) > 0.0) & (played.times <= seconds + 1e-9)
+        )
         some, times = _shown(robot, played.markers.shape[1]), played.times[frames]
-        positions[model] = at_times(whole.q[:, 0].double().cpu().numpy(), np.asarray(whole.times), times)
+        positions[model] = at_times(
+            whole.q[:, 0].double().cpu().numpy(), np.asarray(whole.times), times
+        )
         markers[model] = played.shown(whole)[frames][:, some]
     mesh = robot.simulator.body.mesh
     bound = robot.observe(robot.state(mesh.vertices))[0].double().cpu().numpy()[some]
     gravity = np.asarray(robot.simulator.gravity, dtype=np.float64)
     from_below, _ = hangs(mesh, robot.simulator.body.fixed_vertices, gravity)
-    seen, obstacles = played.markers[frames][:, some], whole.surface().at(np.rint(times / robot.time_step).astype(int))
+    seen = played.markers[frames][:, some]
+    obstacles = whole.surface().at(np.rint(times / robot.time_step).astype(int))
     shared = run / read_json(run / "stages" / "evaluate.json")["settings"]["shared"] / "stages"
     simulated = (text for stage, text in _PLAYED.items() if (shared / f"{stage}.json").is_file())
     observed = next(simulated, MEASURED_MARKERS)
     return ComparedMotion(
-        mesh, times, seen, positions, markers, bound, gravity, from_below, obstacles=obstacles, observed=observed
+        mesh,
+        times,
+        seen,
+        positions,
+        markers,
+        bound,
+        gravity,
+        from_below,
+        obstacles=obstacles,
+        observed=observed,
     )
 
 
 def _shown(robot: Robot, count: int) -> np.ndarray:
-    """Indices of the markers that are shown: all, or some vertices at the tip where every vertex is observed."""
+    """Indices of the markers that are shown: all, or some vertices at the tip
+    where every vertex is observed.
+    """
     if robot.labels:
         return np.arange(count)
     body = robot.simulator.body

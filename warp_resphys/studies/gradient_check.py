@@ -1,4 +1,6 @@
-"""Adjoint gradients of a short roll-out against central differences, for every kind of parameter."""
+"""Adjoint gradients of a short roll-out against central differences,
+for every kind of parameter.
+"""
 
 import math
 from collections.abc import Callable, Container, Iterator, Sequence
@@ -43,9 +45,9 @@ class GradientRow:
 def central_difference(function: Callable[[float], float]) -> tuple[float, float]:
     """Derivative at zero of a function of one number, and an estimate of its error.
 
-    Central differences over steps of 1, 1/2, 1/4, ... are extrapolated to a step of zero (Ridders 1982). Truncation
-    error dominates the first extrapolations, rounding error the last ones: the one that changes least between steps is
-    returned, with this change as its error.
+    Central differences over steps of 1, 1/2, 1/4, ... are extrapolated to a step of zero (Ridders
+    1982). Truncation error dominates the first extrapolations, rounding error the last ones: the
+    one that changes least between steps is returned, with this change as its error.
     """
     row: list[float] = []
     best, error = math.nan, math.inf
@@ -63,7 +65,8 @@ def central_difference(function: Callable[[float], float]) -> tuple[float, float
 
 
 def pose(simulator: Simulator, name: str, batch: int) -> State:
-    """A state of a body that extends along x from its clamp: at rest, bent, or twisted by 90 degrees about x.
+    """A state of a body that extends along x from its clamp:
+    at rest, bent, or twisted by 90 degrees about x.
 
     Args:
         simulator: of the body.
@@ -95,10 +98,11 @@ def check_gradients(
     names: Container[str] | None = None,
     together: bool = True,
 ) -> list[GradientRow]:
-    """Compares the directional derivatives of a random linear functional of all positions and velocities.
+    """Compares the directional derivatives of a random linear functional
+    of all positions and velocities.
 
-    Parameters vary within their bounds, which no difference exceeds. A parameter on a bound, such as damping of zero,
-    cannot be checked: give the simulator another value.
+    Parameters vary within their bounds, which no difference exceeds. A parameter on a bound, such
+    as damping of zero, cannot be checked: give the simulator another value.
 
     Args:
         simulator: with a tight tolerance, in float64.
@@ -106,16 +110,18 @@ def check_gradients(
         steps: number of steps of the roll-out.
         batch: number of environments.
         seed: of the random directions and functional.
-        change: factor of the largest changes; less than one where second derivatives jump, as those of friction do.
-        names: of the inputs and parameters that are compared, with `q` and `v` of the start; None for all.
-        together: whether inputs and parameters of one shape change at the same time, by amounts that contribute
-            about the same, which takes a fraction of the time. The difference of a row is then that of all less the
-            adjoints of the others: a wrong derivative shows in all rows of its shape. Derivatives below a thousandth of
-            the largest are compared alone.
+        change: factor of the largest changes; less than one where second derivatives jump, as those
+            of friction do.
+        names: of the inputs and parameters that are compared, with `q` and `v` of the start; None
+            for all.
+        together: whether inputs and parameters of one shape change at the same time, by amounts
+            that contribute about the same, which takes a fraction of the time. The difference of a
+            row is then that of all less the adjoints of the others: a wrong derivative shows in all
+            rows of its shape. Derivatives below a thousandth of the largest are compared alone.
 
     Returns:
-        A row for initial positions, initial velocities, each input and each parameter. Parameters are checked as one
-        value, as one for each environment, and as one for each element or part.
+        A row for initial positions, initial velocities, each input and each parameter. Parameters
+        are checked as one value, as one for each environment, and as one for each element or part.
     """
     problem = _Problem(simulator, pose_name, steps, batch, seed, change)
     cases = [case for case in problem.cases() if names is None or case.name in names]
@@ -143,7 +149,9 @@ class _Case:
 class _Problem:
     """The loss of a roll-out as a function of the start, inputs and parameters."""
 
-    def __init__(self, simulator: Simulator, pose_name: str, steps: int, batch: int, seed: int, change: float) -> None:
+    def __init__(
+        self, simulator: Simulator, pose_name: str, steps: int, batch: int, seed: int, change: float
+    ) -> None:
         self.simulator, self.steps, self.batch, self.change = simulator, steps, batch, change
         self.random = torch.Generator().manual_seed(seed)
         self.state = pose(simulator, pose_name, batch)
@@ -153,7 +161,8 @@ class _Problem:
             fixed_positions=self.state.q[:, simulator.fixed].expand(steps, -1, -1, -1).clone(),
             attached_mass=1e-4 * (1.0 + self.noise(batch, n).square()),
             **{
-                name: quantity.typical * (1.0 + 0.3 * self.noise(steps, batch, simulator.counts[name]))
+                name: quantity.typical
+                * (1.0 + 0.3 * self.noise(steps, batch, simulator.counts[name]))
                 for name, quantity in simulator.inputs.items()
             },
         )
@@ -161,21 +170,30 @@ class _Problem:
         self.weights = self.noise(steps + 1, batch, n, 3), h * self.noise(steps + 1, batch, n, 3)
 
     def noise(self, *shape: int) -> torch.Tensor:
-        return self.simulator.tensor(torch.randn(*shape, generator=self.random, dtype=torch.float64))
+        return self.simulator.tensor(
+            torch.randn(*shape, generator=self.random, dtype=torch.float64)
+        )
 
     def loss(self, cases: Sequence[_Case], changes: Sequence[torch.Tensor]) -> torch.Tensor:
         """Loss of the roll-out with changes of the start, of inputs and of parameters."""
         return self.losses(cases, [changes])[0]
 
-    def losses(self, cases: Sequence[_Case], variants: Sequence[Sequence[torch.Tensor]]) -> torch.Tensor:
+    def losses(
+        self, cases: Sequence[_Case], variants: Sequence[Sequence[torch.Tensor]]
+    ) -> torch.Tensor:
         """Losses (R,) of R roll-outs side by side, each with changes of its own."""
         count = len(variants)
         values = {
             case.name: self._side_by_side(case, [case.value(changes[k]) for changes in variants])
             for k, case in enumerate(cases)
         }
-        q, v = (values.pop(name, getattr(self.state, name).repeat(count, 1, 1)) for name in ("q", "v"))
-        inputs = {name: self._repeated(name, [value] * count) for name, value in self.inputs.fields.items()}
+        q, v = (
+            values.pop(name, getattr(self.state, name).repeat(count, 1, 1)) for name in ("q", "v")
+        )
+        inputs = {
+            name: self._repeated(name, [value] * count)
+            for name, value in self.inputs.fields.items()
+        }
         inputs |= {name: values.pop(name) for name in [*values] if name in inputs}
         trajectory = self.simulator.rollout(State(q, v), self.steps, Inputs(**inputs), values)
         positions, velocities = (x.unflatten(1, (count, -1)) for x in (trajectory.q, trajectory.v))
@@ -196,7 +214,9 @@ class _Problem:
         return torch.cat([*values], dim=0 if name == "attached_mass" else 1)
 
     def cases(self) -> Iterator[_Case]:
-        """Yields the start and every input and parameter in its shapes, with random changes of typical size."""
+        """Yields the start and every input and parameter in its shapes,
+        with random changes of typical size.
+        """
         simulator = self.simulator
         length = float((self.state.q[0].max(0).values - self.state.q[0].min(0).values).max())
         sizes = {"q": 3e-4 * length, "v": 0.3 * length}
@@ -204,17 +224,26 @@ class _Problem:
         sizes |= {name: 0.1 * quantity.typical for name, quantity in simulator.inputs.items()}
         for name, value in {"q": self.state.q, "v": self.state.v, **self.inputs.fields}.items():
             if value.numel():
-                yield _Case(name, "one", self.direction(sizes[name], *value.shape), partial(torch.add, value))
+                yield _Case(
+                    name,
+                    "one",
+                    self.direction(sizes[name], *value.shape),
+                    partial(torch.add, value),
+                )
         for name, quantity in simulator.parameters.items():
             base = simulator.tensor(simulator.defaults[name])
-            shapes: dict[str, tuple[int, ...]] = {"environment": (self.batch, *(quantity.shape or (3,)))}
+            shapes: dict[str, tuple[int, ...]] = {
+                "environment": (self.batch, *(quantity.shape or (3,)))
+            }
             if name != "gravity" and not quantity.shape:
                 base, shapes = base.mean(), {"environment": (self.batch, 1)}
                 if quantity.per:
                     shapes = {"one": (1,), quantity.per: (simulator.counts[name],), **shapes}
             for kind, shape in shapes.items():
                 size = 0.01 if quantity.shape else 0.7
-                yield _Case(name, kind, self.direction(size, *shape), partial(quantity.varied, base))
+                yield _Case(
+                    name, kind, self.direction(size, *shape), partial(quantity.varied, base)
+                )
 
     def direction(self, size: float, *shape: int) -> torch.Tensor:
         """A random change whose largest entry is the size times the factor of all changes."""
@@ -225,25 +254,40 @@ class _Problem:
         """Rows of cases that change together, or alone where they contribute little."""
         zeros = [torch.zeros_like(case.change, requires_grad=True) for case in cases]
         gradients = torch.autograd.grad(self.loss(cases, zeros), zeros)
-        adjoints = [float((g * case.change).sum()) for g, case in zip(gradients, cases, strict=True)]
+        adjoints = [
+            float((g * case.change).sum()) for g, case in zip(gradients, cases, strict=True)
+        ]
         largest = max(map(abs, adjoints))
         alone = [k for k, adjoint in enumerate(adjoints) if not abs(adjoint) >= _LEAST * largest]
         groups = [[k for k in range(len(cases)) if k not in alone], *([k] for k in alone)]
         return [row for group in groups if group for row in self._rows(cases, adjoints, group)]
 
-    def _rows(self, cases: Sequence[_Case], adjoints: Sequence[float], group: Sequence[int]) -> Iterator[GradientRow]:
-        """Rows of the cases of a group, which change together by amounts that contribute about the same."""
+    def _rows(
+        self, cases: Sequence[_Case], adjoints: Sequence[float], group: Sequence[int]
+    ) -> Iterator[GradientRow]:
+        """Rows of the cases of a group, which change together by amounts
+        that contribute about the same.
+        """
         least = min(abs(adjoints[k]) for k in group)
         shares = {k: least / adjoints[k] if adjoints[k] else 1.0 for k in group}
         if len(group) > 1:  # at random, so that wrong derivatives do not cancel
             factors = 0.5 + 0.5 * torch.rand(len(group), generator=self.random)
-            shares = {k: share * float(factor) for (k, share), factor in zip(shares.items(), factors, strict=True)}
+            shares = {
+                k: share * float(factor)
+                for (k, share), factor in zip(shares.items(), factors, strict=True)
+            }
 
         steps = [sign * 0.5**k for k in range(1 + _HALVINGS) for sign in (1.0, -1.0)]
-        variants = [[step * shares.get(k, 0.0) * case.change for k, case in enumerate(cases)] for step in steps]
-        with torch.no_grad():  # All differences in one batch, as a small body's step takes as long as theirs.
+        variants = [
+            [step * shares.get(k, 0.0) * case.change for k, case in enumerate(cases)]
+            for step in steps
+        ]
+        # All differences in one batch, as a small body's step takes as long as theirs.
+        with torch.no_grad():
             losses = dict(zip(steps, self.losses(cases, variants).tolist(), strict=True))
         total, uncertainty = central_difference(losses.__getitem__)
         error = total - sum(share * adjoints[k] for k, share in shares.items())
         for k, share in shares.items():
-            yield GradientRow(cases[k].title, adjoints[k], adjoints[k] + error / share, abs(uncertainty / share))
+            yield GradientRow(
+                cases[k].title, adjoints[k], adjoints[k] + error / share, abs(uncertainty / share)
+            )

@@ -50,11 +50,17 @@ class Inspection(RecordingInspection):
     @model_validator(mode="before")
     @classmethod
     def _sort_files(cls, values: Any) -> Any:
-        """Moves ``files`` to their keys: the first recording, others to compare it with, and a mesh or surface."""
+        """Moves ``files`` to their keys: the first recording,
+        others to compare it with, and a mesh or surface.
+        """
         if not isinstance(values, Mapping) or not isinstance(values["mesh"], Mapping):
             return values
         files = values["files"] if isinstance(values["files"], list) else []
-        recordings = [file for file in files if Path(str(file)).suffix.lower() in READERS or is_bag(Path(str(file)))]
+        recordings = [
+            file
+            for file in files
+            if Path(str(file)).suffix.lower() in READERS or is_bag(Path(str(file)))
+        ]
         meshes = [file for file in files if file not in recordings]
         if len(meshes) > 1:
             raise ValueError(f"{meshes[0]} and {meshes[1]} are two meshes: name one at a time.")
@@ -62,22 +68,32 @@ class Inspection(RecordingInspection):
         if recordings:
             changed["recording"] = {**values["recording"], "path": recordings[0]}
             changed["compare_with"] = [*values["compare_with"], *recordings[1:]]
-        if mesh["kind"] == "file" and Path(str(mesh.get("path"))).suffix.lower() in SURFACE_SUFFIXES:
-            mesh = {key: value for key, value in mesh.items() if key in SurfaceMesh.model_fields} | {"kind": "surface"}
-        if mesh.get("path") is None:  # the key is there for every kind of mesh, but only some have files
+        if (
+            mesh["kind"] == "file"
+            and Path(str(mesh.get("path"))).suffix.lower() in SURFACE_SUFFIXES
+        ):
+            mesh = {
+                key: value for key, value in mesh.items() if key in SurfaceMesh.model_fields
+            } | {"kind": "surface"}
+        if mesh.get("path") is None:
+            # The key is there for every kind of mesh, but only some have files.
             mesh.pop("path", None)
         changed["mesh"] = None if mesh["kind"] == "file" and "path" not in mesh else mesh
         return changed
 
 
 def inspect(settings: Inspection, folder: Path) -> None:
-    """Prints tables; writes quality.json and quality.png of a recording, mesh.png of a mesh, and the mesh.
+    """Prints tables.
+
+    Writes quality.json and quality.png of a recording, mesh.png of a mesh, and the mesh.
 
     Raises:
         ResphysError: nothing was named, or it cannot be used.
     """
     if settings.mesh is None and settings.recording.path is None:
-        raise InputError("nothing to inspect: name a mesh or a recording, as in warp-resphys inspect FILE.")
+        raise InputError(
+            "nothing to inspect: name a mesh or a recording, as in warp-resphys inspect FILE."
+        )
     if settings.recording.path is not None:
         print(inspect_recording(settings, folder))
         print(f"Written: {folder / 'quality.json'}, {folder / 'quality.png'}")
@@ -89,7 +105,9 @@ def inspect(settings: Inspection, folder: Path) -> None:
             print(f"Written: {', '.join(written)}")
 
 
-def inspect_mesh(settings: MeshSettings, fixed: Place, density: float, picture: Path | None, file: Path | None) -> str:
+def inspect_mesh(
+    settings: MeshSettings, fixed: Place, density: float, picture: Path | None, file: Path | None
+) -> str:
     """Returns a table of a mesh, draws it, and writes it with the names of its surfaces.
 
     Args:
@@ -109,7 +127,9 @@ def inspect_mesh(settings: MeshSettings, fixed: Place, density: float, picture: 
         points = read_vertices(path, units)
         mesh = read_mesh(path, units, order, drop_unreferenced=True)
         unused = len(points) - len(read_mesh(path, units, drop_unreferenced=True).vertices)
-        rows.append(("vertices in the file", f"{len(points):,} = {3 * len(points):,} degrees of freedom"))
+        rows.append(
+            ("vertices in the file", f"{len(points):,} = {3 * len(points):,} degrees of freedom")
+        )
         if unused:
             how = "left out of .msh and .inp, and elsewhere by drop_unreferenced"
             rows.append(("of these unused", f"{unused} belong to no cell: {how}"))
@@ -122,7 +142,12 @@ def inspect_mesh(settings: MeshSettings, fixed: Place, density: float, picture: 
     summary = MeshSummary(mesh, vertices, find_chambers(mesh))
     rows += summary_rows(summary, density)
     if place is not None:
-        rows.append(("fixed", f"{place.holds(points).sum()} vertices at {place} m, {len(vertices)} of them used"))
+        rows.append(
+            (
+                "fixed",
+                f"{place.holds(points).sum()} vertices at {place} m, {len(vertices)} of them used",
+            )
+        )
     if isinstance(settings, FileMesh):
         names = ", ".join(f"{name} ({len(faces)})" for name, faces in surfaces.items())
         rows.append(("surfaces with a name", names or "none"))
@@ -132,11 +157,18 @@ def inspect_mesh(settings: MeshSettings, fixed: Place, density: float, picture: 
     if not mesh.element.parents:
         rows.append(("quadratic cells", _quadratic_cells(mesh, place)))
         if thin := [name for name, cells in mesh.regions.items() if is_one_cell_thick(mesh, cells)]:
-            rows.append(("one cell thick", f"{', '.join(thin)}: if stiffer than the rest, take quadratic cells"))
+            rows.append(
+                (
+                    "one cell thick",
+                    f"{', '.join(thin)}: if stiffer than the rest, take quadratic cells",
+                )
+            )
     if file is not None:
         if isinstance(settings, ArmMesh):
             if settings.order == 2 and settings.cells != "tetrahedra":
-                raise MeshError("mesh.order is 2: choose 1, or 2 for tetrahedra with edge midpoints.")
+                raise MeshError(
+                    "mesh.order is 2: choose 1, or 2 for tetrahedra with edge midpoints."
+                )
             surfaces = name_surfaces(mesh)
         write_mesh(file, mesh, surfaces)
     if picture is not None:
@@ -146,7 +178,8 @@ def inspect_mesh(settings: MeshSettings, fixed: Place, density: float, picture: 
 
 
 def _quadratic_cells(mesh: Mesh, fixed: Place | None) -> str:
-    """Returns how much quadratic cells change the deflection under the weight, across the longest side of a body.
+    """Returns how much quadratic cells change the deflection under the weight,
+    across the longest side of a body.
 
     Args:
         mesh: of linear cells.
@@ -163,7 +196,12 @@ def _quadratic_cells(mesh: Mesh, fixed: Place | None) -> str:
     if base.all() or not all(_spans_area(mesh.vertices[piece[base[piece]]]) for piece in pieces):
         return "not compared: a piece is not held, or all of it"
     # Nodes between held vertices are held, too.
-    between = quadratic(Mesh(np.repeat(base[:, None], 3, axis=1).astype(np.float64), mesh.cells)).vertices[:, 0] == 1.0
+    between = (
+        quadratic(
+            Mesh(np.repeat(base[:, None], 3, axis=1).astype(np.float64), mesh.cells)
+        ).vertices[:, 0]
+        == 1.0
+    )
     for compared, still in ((mesh, base), (finer, between)):
         simulator = Simulator(Body(compared, fixed=np.flatnonzero(still)), _SILICONE)
         step = simulator.linearise_equilibrium()
@@ -175,24 +213,30 @@ def _quadratic_cells(mesh: Mesh, fixed: Place | None) -> str:
     change = float(max(work[1] / work[0] - 1.0, key=abs))
     where = f"at the lower end along {'xyz'[along]}" if fixed is None else f"at {fixed} m"
     return (
-        f"sag {_PERCENT * abs(change):.0f} % {'more' if change > 0.0 else 'less'} under their weight, held {where}"
-        f"{': these cells are too coarse' if abs(change) > NOTICED else ''}"
+        f"sag {_PERCENT * abs(change):.0f} % {'more' if change > 0.0 else 'less'} under their "
+        f"weight, held {where}{': these cells are too coarse' if abs(change) > NOTICED else ''}"
     )
 
 
 def _spans_area(points: FloatArray) -> bool:
-    """Whether three points of (n, 3) are not in a line, by which a body that is held there cannot turn."""
+    """Whether three points of (n, 3) are not in a line,
+    by which a body that is held there cannot turn.
+    """
     return len(points) > 2 and bool(np.linalg.svd(points - points.mean(axis=0))[1][1] > 1e-9)
 
 
 def _cavities(mesh: Mesh) -> str:
     """Describes open cavities: area and centre of their openings."""
     places = [
-        f"{1e4 * cavity.area:.1f} cm2 around ({_millimetres(cavity.centre)}) mm" for cavity in open_cavities(mesh)
+        f"{1e4 * cavity.area:.1f} cm2 around ({_millimetres(cavity.centre)}) mm"
+        for cavity in open_cavities(mesh)
     ]
     if not places:
         return "none"
-    return f"{'; '.join(places)}: pressure needs a closed chamber, or faces with held edges (chambers.faces)"
+    return (
+        f"{'; '.join(places)}: pressure needs a closed chamber, "
+        "or faces with held edges (chambers.faces)"
+    )
 
 
 def _millimetres(point: FloatArray) -> str:
@@ -203,13 +247,16 @@ def summary_rows(summary: MeshSummary, density: float) -> list[tuple[str, str]]:
     """Rows of a table: sizes, mass, quality and chambers of a mesh."""
     mesh, (width, depth, height) = summary.mesh, _MILLI * np.ptp(summary.mesh.vertices, axis=0)
     volume = float(cell_volumes(mesh).sum())
-    body, boundary = (connected_parts(cells).max() + 1 for cells in (mesh.cells, boundary_triangles(mesh)))
+    body, boundary = (
+        connected_parts(cells).max() + 1 for cells in (mesh.cells, boundary_triangles(mesh))
+    )
     rows = [
         ("vertices", f"{len(mesh.vertices):,} = {mesh.vertices.size:,} degrees of freedom"),
         ("cells", f"{len(mesh.cells):,} of kind {mesh.kind}"),
         (
             "bounding box",
-            f"{width:.1f} x {depth:.1f} x {height:.1f} mm from ({_millimetres(mesh.vertices.min(axis=0))}) mm",
+            f"{width:.1f} x {depth:.1f} x {height:.1f} mm from "
+            f"({_millimetres(mesh.vertices.min(axis=0))}) mm",
         ),
         ("volume", f"{_CUBIC_CENTI * volume:.1f} cm3"),
         ("mass", f"{1e3 * volume * density:.1f} g at {density:g} kg/m3"),
@@ -219,7 +266,9 @@ def summary_rows(summary: MeshSummary, density: float) -> list[tuple[str, str]]:
     for chamber in summary.chambers:
         centre = _millimetres(mesh.vertices[chamber.vertices].mean(axis=0))
         inside = _CUBIC_CENTI * summary.chamber_volume(chamber)
-        rows.append((chamber.name, f"{len(chamber.faces)} faces, {inside:.2f} cm3, centre ({centre}) mm"))
+        rows.append(
+            (chamber.name, f"{len(chamber.faces)} faces, {inside:.2f} cm3, centre ({centre}) mm")
+        )
     if not summary.chambers:
         rows.append(("chambers", "none is closed"))
     return rows

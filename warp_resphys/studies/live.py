@@ -1,4 +1,6 @@
-"""A robot for interactive simulation: driven by hand or by a recorded trial, pulled, with changed parameters."""
+"""A robot for interactive simulation: driven by hand or by a recorded trial,
+pulled, with changed parameters.
+"""
 
 from collections.abc import Mapping
 from typing import Final
@@ -20,15 +22,24 @@ from ..robot.robot import Robot
 from ..stepping.quantity import Quantity
 from ..stepping.state import State
 
-MATERIAL: Final = ("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping")
+MATERIAL: Final = (
+    "youngs_modulus",
+    "poissons_ratio",
+    "density",
+    "mass_damping",
+    "stiffness_damping",
+)
 _ROUNDING: Final = 1e-9  # Of times [s].
 _PATCH: Final = 0.06  # Radius of the surface patch that is grabbed, over the size of the body.
 _PULL: Final = 10.0  # Pulling force at a distance of one body size, in weights of the body.
-_STIFFEST: Final = 0.25  # Upper bound of the stiffness of a pull, in mass of the body over squared time step.
+_STIFFEST: Final = (
+    0.25  # Upper bound of the stiffness of a pull, in mass of the body over squared time step.
+)
 _WIDE: Final = 1.4  # Logarithm of the factor by which a parameter may be changed.
 _BEYOND: Final = 1.25  # Largest input, over that of the trials.
 _BASE_SPEED: Final = 1.0  # Largest speed of the base, in sizes of the body, and rad, a second.
-_MOVED: Final = (0.25, 0.5)  # Largest displacement of base and obstacles, over the body's size, and rotation [rad].
+# Largest displacement of base and obstacles, over the body's size, and rotation [rad].
+_MOVED: Final = (0.25, 0.5)
 
 
 class LiveRobot:
@@ -43,7 +54,8 @@ class LiveRobot:
         inputs: (C,) commanded values by name.
         limits: lowest and highest values (C,) of the parts of each input.
         parameters: quantities and original values of the parameters that may be changed, by name.
-        held: weights (N,) of the vertices that are pulled, and the point (3,) to which they are [m]; None if none is.
+        held: weights (N,) of the vertices that are pulled, and the point (3,) to which they are
+            [m]; None if none is.
         moved: (O,) inputs that moved obstacles in the last step, by name.
         time: since the start of the motion [s].
         failure: why the simulation stopped; empty while it runs.
@@ -54,12 +66,15 @@ class LiveRobot:
         mesh = robot.simulator.body.mesh
         self.size = float(np.ptp(mesh.vertices, axis=0).max())
         self.surface = surface_vertices(mesh)
-        self.inputs = {name: np.zeros(len(robot_input.parts)) for name, robot_input in robot.inputs.items()}
+        self.inputs = {
+            name: np.zeros(len(robot_input.parts)) for name, robot_input in robot.inputs.items()
+        }
         self.limits = {name: self._limits(name) for name in robot.inputs}
         self.parameters = {} if robot.is_data_driven else _changeable(robot)
         mass = float(robot.constants.mass.sum())
         weight = mass * float(np.linalg.norm(robot.simulator.gravity)) or mass
-        self._stiffness = min(_PULL * weight / self.size, _STIFFEST * mass / robot.time_step**2)  # [N/m]
+        # [N/m]
+        self._stiffness = min(_PULL * weight / self.size, _STIFFEST * mass / robot.time_step**2)
         self.held: tuple[FloatArray, FloatArray] | None = None
         self._on_body = _markers_on_body(robot)
         self.moved: dict[str, FloatArray] = {}
@@ -75,11 +90,18 @@ class LiveRobot:
             far = np.repeat([_MOVED[0] * self.size, _MOVED[1]], 3)
             return -far, far
         if robot_input.quantity in MOTION:
-            far = np.full(len(robot_input.parts), _MOVED[1] if robot_input.unit == "rad" else _MOVED[0] * self.size)
+            far = np.full(
+                len(robot_input.parts),
+                _MOVED[1] if robot_input.unit == "rad" else _MOVED[0] * self.size,
+            )
             return -far, far
         if robot_input.low is None or robot_input.high is None:
-            return np.zeros(len(robot_input.parts)), np.full(len(robot_input.parts), robot_input.quantity.typical)
-        return _BEYOND * np.minimum(robot_input.low, 0.0), _BEYOND * np.maximum(robot_input.high, 0.0)
+            return np.zeros(len(robot_input.parts)), np.full(
+                len(robot_input.parts), robot_input.quantity.typical
+            )
+        return _BEYOND * np.minimum(robot_input.low, 0.0), _BEYOND * np.maximum(
+            robot_input.high, 0.0
+        )
 
     # Views of the state
 
@@ -98,7 +120,8 @@ class LiveRobot:
 
     @property
     def measured(self) -> FloatArray | None:
-        """Measured markers (M, 3) of the trial at this time [m], interpolated linearly between frames.
+        """Measured markers (M, 3) of the trial at this time [m],
+        interpolated linearly between frames.
 
         NaN for hidden markers; None without a trial.
         """
@@ -119,7 +142,9 @@ class LiveRobot:
         return np.asarray(markers if shift is None else markers + shift)
 
     def _to_body(self, recorded: FloatArray) -> RigidTransform:
-        """Transform to the frame of the body from that of the recordings, in which markers (M, 3) are given [m]."""
+        """Transform to the frame of the body from that of the recordings,
+        in which markers (M, 3) are given [m].
+        """
         assert self._on_body is not None
         on_body = self._on_body(self.state.q)[0].double().cpu().numpy()
         seen = np.isfinite(recorded).all(axis=1)
@@ -153,7 +178,9 @@ class LiveRobot:
     def grab(self, point: FloatArray) -> None:
         """Grabs the surface around a point (3,) [m]."""
         if self.robot.is_data_driven:
-            raise InputError("a network in the simulator's place feels no force: view another model to pull it.")
+            raise InputError(
+                "a network in the simulator's place feels no force: view another model to pull it."
+            )
         q = self.positions
         away = np.linalg.norm(q[self.surface] - point, axis=1)
         near = np.exp(-0.5 * ((away - away.min()) / (_PATCH * self.size)) ** 2)
@@ -195,14 +222,25 @@ class LiveRobot:
     # Time
 
     def step(self) -> bool:
-        """Simulates one time step; returns False where the trial is over or the simulation failed."""
-        if self.failure or (self.trial is not None and self.time >= self.trial.times[-1] - _ROUNDING):
+        """Simulates one time step.
+
+        Returns False where the trial is over or the simulation failed.
+        """
+        if self.failure or (
+            self.trial is not None and self.time >= self.trial.times[-1] - _ROUNDING
+        ):
             return False
         acting = dict[str, torch.Tensor | FloatArray](self._commanded())
         if self.held is not None:
             weights, target = self.held
-            acting["external_force"] = weights[:, None] * (self._stiffness * (target - weights @ self.positions))
-        wanted = {name: np.asarray(acting.pop(name)) for name in [q.name for q in MOTION] if name in acting}
+            acting["external_force"] = weights[:, None] * (
+                self._stiffness * (target - weights @ self.positions)
+            )
+        wanted = {
+            name: np.asarray(acting.pop(name))
+            for name in [q.name for q in MOTION]
+            if name in acting
+        }
         placed = self._obstacles(wanted)
         try:
             with torch.no_grad():
@@ -215,8 +253,13 @@ class LiveRobot:
 
     @property
     def _reach(self) -> float:
-        """Distance at which contact begins [m], by which obstacles may move in a step; infinite without contact."""
-        contacts = [energy for energy in self.robot.simulator.body.energies if isinstance(energy, Contact)]
+        """Distance at which contact begins [m], by which obstacles may move in a step.
+
+        Infinite without contact.
+        """
+        contacts = [
+            energy for energy in self.robot.simulator.body.energies if isinstance(energy, Contact)
+        ]
         return min((contact.distance for contact in contacts), default=np.inf)
 
     def _obstacles(self, wanted: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
@@ -232,7 +275,11 @@ class LiveRobot:
                 target = wanted[name]
                 before = self.moved.get(name, np.zeros_like(values))
                 far = self._reach if number < 3 else self._reach / self.size
-                step = target - before if self.trial is not None else np.clip(target - before, -far, far)
+                step = (
+                    target - before
+                    if self.trial is not None
+                    else np.clip(target - before, -far, far)
+                )
                 values = before + step
             placed[name] = values
         return placed
@@ -247,12 +294,17 @@ class LiveRobot:
                 self.inputs[name][:] = at.reshape(-1).double().cpu().numpy()
         acting = {name: values.copy() for name, values in self.inputs.items() if name != BASE}
         if self._base is not None or (BASE in self.inputs and self.inputs[BASE].any()):
-            acting[BASE] = self.inputs[BASE].copy() if self.trial is not None else self._moved_base()
+            acting[BASE] = (
+                self.inputs[BASE].copy() if self.trial is not None else self._moved_base()
+            )
         return acting
 
     @property
     def _base(self) -> torch.Tensor | None:
-        """Displacement (1, 2, 6) of the base before and after the last step [m, rad]; None if it never moved."""
+        """Displacement (1, 2, 6) of the base before and after the last step [m, rad].
+
+        None if it never moved.
+        """
         return self.state.memory_of().get(BASE)
 
     def _moved_base(self) -> FloatArray:
@@ -264,7 +316,10 @@ class LiveRobot:
 
 
 def _markers_on_body(robot: Robot) -> Markers | None:
-    """Markers in the frame of the body, where recordings have their own frame; None where these are the same."""
+    """Markers in the frame of the body, where recordings have their own frame.
+
+    None where these are the same.
+    """
     about = robot.description
     if (
         about.markers is None
@@ -283,16 +338,23 @@ def _changeable(robot: Robot) -> dict[str, tuple[Quantity, float]]:
         quantity = simulator.parameters.get(name)
         if quantity is None or name in changeable or name == "gravity":
             continue
-        value = simulator.tensor(robot.parameters.get(name, simulator.defaults.get(name, float("nan"))))
+        value = simulator.tensor(
+            robot.parameters.get(name, simulator.defaults.get(name, float("nan")))
+        )
         if value.numel() == 1 and bool(torch.isfinite(value).all()):
             changeable[name] = (quantity, float(value))
     return changeable
 
 
 def range_of(quantity: Quantity, value: float) -> tuple[float, float]:
-    """Returns the lowest and highest value to which a parameter may be set, given its original value."""
+    """Returns the lowest and highest value to which a parameter may be set,
+    given its original value.
+    """
     at = torch.tensor(value, dtype=torch.float64)
     if value == quantity.lower:  # Such as zero damping.
         return value, value + quantity.typical
-    low, high = (float(quantity.varied(at, torch.tensor(sign * _WIDE, dtype=torch.float64))) for sign in (-1, 1))
+    low, high = (
+        float(quantity.varied(at, torch.tensor(sign * _WIDE, dtype=torch.float64)))
+        for sign in (-1, 1)
+    )
     return low, high

@@ -35,7 +35,10 @@ class LiveScene:
         self._scene, self.handles = server.scene, dict[str, Any]()
         self._scale, self._middle = 1.0 / float(np.ptp(rest, axis=0).max()), rest.mean(axis=0)
         up, camera = upwards(gravity), server.initial_camera
-        camera.look_at, camera.position = (0.0, 0.0, 0.0), _triple(_AWAY * side_axes(up, *_ANGLES)[2])
+        camera.look_at, camera.position = (
+            (0.0, 0.0, 0.0),
+            _triple(_AWAY * side_axes(up, *_ANGLES)[2]),
+        )
         camera.up = _triple(up)
         server.scene.set_up_direction(_triple(up))
 
@@ -44,8 +47,15 @@ class LiveScene:
         return np.asarray(point, dtype=np.float64) / self._scale + self._middle
 
     def draw(self, name: str, layer: Layer) -> None:
-        """Draws a layer, or moves it to its points; it is hidden where it has none. Sizes are over that of the body."""
-        seen = layer.points if layer.cells is not None else layer.points[np.isfinite(layer.points).all(axis=1)]
+        """Draws a layer, or moves it to its points; it is hidden where it has none.
+
+        Sizes are over that of the body.
+        """
+        seen = (
+            layer.points
+            if layer.cells is not None
+            else layer.points[np.isfinite(layer.points).all(axis=1)]
+        )
         handle = self.handles.get(name)
         if len(seen):
             points = np.asarray((seen - self._middle) * self._scale, dtype=np.float32)
@@ -59,11 +69,18 @@ class LiveScene:
     def _added(self, name: str, layer: Layer, points: NDArray[np.float32]) -> Any:
         red, green, blue = (round(255 * part) for part in to_rgb(layer.colour))
         if layer.kind == "surface" and layer.cells is not None:
-            options: dict[str, Any] = {"opacity": layer.opacity if layer.opacity < 1.0 else None, "side": "double"}
+            options: dict[str, Any] = {
+                "opacity": layer.opacity if layer.opacity < 1.0 else None,
+                "side": "double",
+            }
             faces, colour = layer.cells.astype(np.uint32), (red, green, blue)
-            return self._scene.add_mesh_simple(f"/{name}", points, faces, color=colour, flat_shading=True, **options)
+            return self._scene.add_mesh_simple(
+                f"/{name}", points, faces, color=colour, flat_shading=True, **options
+            )
         if layer.kind == "lines":
-            return self._scene.add_line_segments(f"/{name}", points, (red, green, blue), thickness=_THIN)
+            return self._scene.add_line_segments(
+                f"/{name}", points, (red, green, blue), thickness=_THIN
+            )
         look: dict[str, Any] = {"point_size": layer.size, "point_shape": "circle"}
         return self._scene.add_point_cloud(f"/{name}", points, (red, green, blue), **look)
 

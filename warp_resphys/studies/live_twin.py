@@ -60,7 +60,9 @@ def trial_packets(robot: Robot, name: str) -> Iterator[Packet]:
         commands = {}
         for key, value in trial.inputs.items():
             series = np.asarray(value)
-            commands[key] = (series[min(number, len(series) - 1)] if series.ndim == 3 else series).ravel()
+            commands[key] = (
+                series[min(number, len(series) - 1)] if series.ndim == 3 else series
+            ).ravel()
         labels = names or [f"vertex_{vertex}" for vertex in range(len(frame))]
         yield Packet(float(moment), dict(zip(labels, frame, strict=True)), commands)
 
@@ -125,7 +127,10 @@ class LiveTwin:
             return trial_packets(self.robot, self._source)
         if not Path(self._source).expanduser().exists():
             known = f", a trial of the run ({listed(names)})" if names else ""
-            raise InputError(f"source is {self._source!r}: give udp://HOST:PORT{known}, or a file of a recording.")
+            raise InputError(
+                f"source is {self._source!r}: give udp://HOST:PORT{known}, "
+                "or a file of a recording."
+            )
         return recorded_packets(self.robot, self._source)
 
     # Views of the state
@@ -133,25 +138,37 @@ class LiveTwin:
     @property
     def positions(self) -> FloatArray:
         """Estimated positions (N, 3) of the vertices [m]."""
-        state = self.robot.simulator.rest_positions if self._estimate is None else self._estimate.state.q[0]
+        state = (
+            self.robot.simulator.rest_positions
+            if self._estimate is None
+            else self._estimate.state.q[0]
+        )
         return np.asarray(state.double().cpu().numpy())
 
     @property
     def target(self) -> FloatArray | None:
         """Predicted positions (N, 3) of the vertices [m]."""
-        return None if self._prediction is None else self._prediction.state.q[0].double().cpu().numpy()
+        return (
+            None if self._prediction is None else self._prediction.state.q[0].double().cpu().numpy()
+        )
 
     @property
     def markers(self) -> FloatArray:
         """Estimated markers (M, 3) [m]; empty where every vertex is observed."""
-        return np.empty((0, 3)) if self._estimate is None or not self.robot.labels else self._estimate.markers
+        return (
+            np.empty((0, 3))
+            if self._estimate is None or not self.robot.labels
+            else self._estimate.markers
+        )
 
     @property
     def measured(self) -> FloatArray | None:
         """Markers (M, 3) of the last packet [m]; NaN for those that were not seen."""
         if not self._seen or not self.robot.labels:
             return None
-        return np.array([self._seen.get(label, [np.nan] * 3) for label in self.robot.labels], dtype=np.float64)
+        return np.array(
+            [self._seen.get(label, [np.nan] * 3) for label in self.robot.labels], dtype=np.float64
+        )
 
     @property
     def has_left(self) -> bool:
@@ -168,13 +185,19 @@ class LiveTwin:
         off = self.twin.disagreement
         if off is not None:
             lines.append(
-                f"{self.twin.horizon:g} s ahead: {off.twin:.2f} mm off; markers held {off.held:.2f} mm; "
-                f"{100 * off.covered:.0f} % in intervals of 90 %"
+                f"{self.twin.horizon:g} s ahead: {off.twin:.2f} mm off; markers held "
+                f"{off.held:.2f} mm; {100 * off.covered:.0f} % in intervals of 90 %"
             )
             engine = self.twin.estimator.engine
-            lines.append(f"{engine} without markers: {off.simulator:.2f} mm off; {_ADVICE[off.best].format(engine)}")
+            lines.append(
+                f"{engine} without markers: {off.simulator:.2f} mm off; "
+                f"{_ADVICE[off.best].format(engine)}"
+            )
         if self.twin.counts.get(JUMPS, 0) > _LOST:
-            lines.append("Many jumps of the whole body: are packets in metres, in the robot's frame? (twin.align=true)")
+            lines.append(
+                "Many jumps of the whole body: are packets in metres, in the robot's frame? "
+                "(twin.align=true)"
+            )
         faults = self.twin.counts | (self._listener.refused if self._listener is not None else {})
         return [*lines, *(f"{what}: {count} times" for what, count in faults.items())]
 
@@ -194,7 +217,10 @@ class LiveTwin:
         return bool(taken) or (self._next is not None and not self.failure)
 
     def _tried(self, task: Callable[..., None], *arguments: Any) -> bool:
-        """Does a task; an error ends what plays a recording, and is counted for packets of others."""
+        """Does a task.
+
+        An error ends what plays a recording, and is counted for packets of others.
+        """
         try:
             task(*arguments)
         except ResphysError as error:
@@ -236,7 +262,9 @@ class LiveTwin:
             packets, now = list(self._listener.packets()), time.perf_counter()
             if len(packets) > 1 and now - self._drained > _BEHIND:
                 self.twin.restart("after it had fallen behind")
-                latest = {name: value for packet in packets for name, value in packet.inputs.items()}
+                latest = {
+                    name: value for packet in packets for name, value in packet.inputs.items()
+                }
                 plans = [packet.plan for packet in packets if packet.plan is not None]
                 packets = [replace(packets[-1], inputs=latest, plan=plans[-1] if plans else None)]
             self._drained = now

@@ -1,4 +1,6 @@
-"""Trains policies on the reduced models of a run, and tests them and scripted ones on the run's laboratory."""
+"""Trains policies on the reduced models of a run, and tests them
+and scripted ones on the run's laboratory.
+"""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +26,8 @@ if TYPE_CHECKING:
 
 _SEED: Final = 1000  # of the test episodes
 _PREVIEWS: Final = 3  # goals ahead that a scripted policy may aim at
-_SHARES: Final = (0.5, 0.75, 1.0)  # of the range of the input, with which a scripted policy closes a gripper
+# Of the range of the input, with which a scripted policy closes a gripper.
+_SHARES: Final = (0.5, 0.75, 1.0)
 
 
 class Policies(Settings):
@@ -36,7 +39,9 @@ class Policies(Settings):
     steps: Natural = setting(description="actions of all robots together")
     robots: Natural = setting(description="that learn at once")
     episodes: Natural = setting(description="of the test")
-    seeds: Annotated[Some[Count], AfterValidator(different)] = setting(description="of the policies")
+    seeds: Annotated[Some[Count], AfterValidator(different)] = setting(
+        description="of the policies"
+    )
 
     @property
     def learned_on(self) -> str:
@@ -47,11 +52,12 @@ class Policies(Settings):
 def train_policy(settings: Policies, folder: Path) -> None:
     """Prints errors; writes policies and their errors into the folder ``policies`` of the run.
 
-    Policies that were trained before with the same settings on the same run are not trained again, nor tested again in
-    the same episodes, so that an interrupted command continues.
+    Policies that were trained before with the same settings on the same run are not trained again,
+    nor tested again in the same episodes, so that an interrupted command continues.
 
     Raises:
-        InputError: Gymnasium or Stable-Baselines3 is not installed, or the run has no driven robot or no laboratory.
+        InputError: Gymnasium or Stable-Baselines3 is not installed, or the run has no driven robot
+            or no laboratory.
         DataFileError: there is no finished run.
     """
     del folder
@@ -76,7 +82,10 @@ def train_policy(settings: Policies, folder: Path) -> None:
     _test(policies, environments, run / "policies" / f"{task}_trials.json", settings.episodes)
     path = run / "policies" / f"{task}.json"
     errors = {name: policy.errors for name, policy in policies.items()}
-    write_json(path, {"settings": settings.model_dump(exclude={"run"}), "actions_s": speeds, "errors": errors})
+    write_json(
+        path,
+        {"settings": settings.model_dump(exclude={"run"}), "actions_s": speeds, "errors": errors},
+    )
     groups: dict[str, list[_Policy]] = {}
     for policy in policies.values():
         groups.setdefault(policy.group, []).append(policy)
@@ -89,7 +98,11 @@ def train_policy(settings: Policies, folder: Path) -> None:
         title += f", policies of {len(settings.seeds)} seeds (lowest to highest)"
     rates = ", ".join(f"{model} {np.mean(speed):.0f}" for model, speed in speeds.items())
     wrote = f"Written: {path} and the policies beside it"
-    show(PageTable.plain(title, ["policy", *worlds], rows), f"Actions a second while learning: {rates}.", wrote)
+    show(
+        PageTable.plain(title, ["policy", *worlds], rows),
+        f"Actions a second while learning: {rates}.",
+        wrote,
+    )
 
 
 class _Errors(TypedDict):
@@ -122,7 +135,13 @@ def _policies(
     speeds: dict[str, list[float]] = {model: [] for model in models}
     for model in models:
         robots = make_vector(
-            task, run, settings.robots, model, settings.learned_on, autoreset_mode="SameStep", reach=reaches[models[-1]]
+            task,
+            run,
+            settings.robots,
+            model,
+            settings.learned_on,
+            autoreset_mode="SameStep",
+            reach=reaches[models[-1]],
         )
         if (reach := reaches[model]) is None:
             for share in _SHARES:
@@ -133,16 +152,23 @@ def _policies(
                 name = f"scripted, {model}, place {ahead + 1}"
                 policies[name] = _Policy(name, ScriptedPolicy(robots, ahead, reach), origin)
         for seed in settings.seeds:
-            saved, about = (run / "policies" / f"{task}_{model}_{seed}{suffix}" for suffix in (".zip", ".json"))
+            saved, about = (
+                run / "policies" / f"{task}_{model}_{seed}{suffix}" for suffix in (".zip", ".json")
+            )
             asked = {"steps": settings.steps, "robots": settings.robots, "seed": seed, **origin}
             record = read_json(about) if about.is_file() and saved.is_file() else {}
             if record.get("asked") != asked:
                 about.unlink(missing_ok=True)
                 began = time.perf_counter()
-                with Progress(f"policy on {model}, seed {seed}", settings.steps, "actions") as progress:
+                with Progress(
+                    f"policy on {model}, seed {seed}", settings.steps, "actions"
+                ) as progress:
                     learned = learn(robots, settings.steps, seed, progress.advance)
                 learned.save(saved)
-                record = {"asked": asked, "actions_s": learned.num_timesteps / (time.perf_counter() - began)}
+                record = {
+                    "asked": asked,
+                    "actions_s": learned.num_timesteps / (time.perf_counter() - began),
+                }
                 write_json(about, record)
             speeds[model].append(record["actions_s"])
             name = f"PPO, {model}"
@@ -150,15 +176,26 @@ def _policies(
     return policies, speeds
 
 
-def _test(policies: Mapping[str, _Policy], environments: Mapping[str, Any], path: Path, episodes: int) -> None:
-    """Fills the errors of policies in all worlds; results of the same episodes are read from `path`."""
+def _test(
+    policies: Mapping[str, _Policy], environments: Mapping[str, Any], path: Path, episodes: int
+) -> None:
+    """Fills the errors of policies in all worlds.
+
+    Results of the same episodes are read from `path`.
+    """
     from ..environments.policies import errors_mm
 
     kept = read_json(path) if path.is_file() else {}
     asked = {name: {**policy.asked, "episodes": episodes} for name, policy in policies.items()}
     every = [(name, world) for name in policies for world in environments]
-    left = [(name, world) for name, world in every if kept.get(name, {}).get(world, {}).get("asked") != asked[name]]
-    total, to_do = (sum(environments[world].actions for _, world in pairs) for pairs in (every, left))
+    left = [
+        (name, world)
+        for name, world in every
+        if kept.get(name, {}).get(world, {}).get("asked") != asked[name]
+    ]
+    total, to_do = (
+        sum(environments[world].actions for _, world in pairs) for pairs in (every, left)
+    )
     with Progress("trials", total, "actions", total - to_do) as progress:
         for name, world in left:
             errors = errors_mm(environments[world], policies[name].act, _SEED, progress.advance)
@@ -175,7 +212,9 @@ def _test(policies: Mapping[str, _Policy], environments: Mapping[str, Any], path
 
 
 def _text(errors: Sequence[_Errors]) -> str:
-    """Mean error of policies that differ in their seed, lowest and highest of them, and number of failed robots."""
+    """Mean error of policies that differ in their seed,
+    lowest and highest of them, and number of failed robots.
+    """
     means = [error["mean_mm"] for error in errors if error["mean_mm"] is not None]
     failures = sum(error["failed"] for error in errors)
     text = f"{np.mean(means):.2f}" if means else "-"

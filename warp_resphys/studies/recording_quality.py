@@ -1,4 +1,6 @@
-"""Quality of a recording as a table and a picture: occlusions, jumps, noise and drift of its markers; conversion."""
+"""Quality of a recording as a table and a picture: occlusions, jumps,
+noise and drift of its markers; conversion.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
@@ -38,7 +40,15 @@ from ..report.wording import TONES
 from ..settings.data_kinds import BagSettings, TableSettings
 
 # Okabe and Ito (2008), without yellow: everyone can tell them apart.
-MARKER_COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#1c2127")
+MARKER_COLOURS: Final = (
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#56b4e9",
+    "#e69f00",
+    "#1c2127",
+)
 _STATES: Final = {"seen": "#dde1e6", "filled": "#e69f00", "masked": "#c4481b"}
 _MILLI: Final = 1e3
 _ROW: Final = 0.16  # [in] of a marker in the raster
@@ -71,33 +81,50 @@ class RecordingInspection(Settings):
 def recording_quality(recording: Recording, result: Quality) -> Figure:
     """Draws displacements of markers from their median position over time, jumps and occlusions.
 
-    Markers that should stand still have their own panel, with their distance from the median position. A line breaks
-    where a gap is masked; where it was filled, the line is thin. A triangle marks the first frame after a jump.
+    Markers that should stand still have their own panel, with their distance from the median
+    position. A line breaks where a gap is masked; where it was filled, the line is thin. A triangle
+    marks the first frame after a jump.
     """
-    several = [label for label, seen in zip(recording.labels, recording.seen.T, strict=True) if seen.sum() > 1]
+    several = [
+        label
+        for label, seen in zip(recording.labels, recording.seen.T, strict=True)
+        if seen.sum() > 1
+    ]
     bridged = fill_gaps(recording.select(several), result.longest_gap_filled)
     still = {marker.label for marker in result.markers if marker.still}
     panels = [*("xyz" if len(still) < len(recording.labels) else ""), *(["still"] if still else [])]
-    heights = [*(1.2 if panel == "still" else 1.5 for panel in panels), _ROW * len(recording.labels) + 0.1]
+    heights = [
+        *(1.2 if panel == "still" else 1.5 for panel in panels),
+        _ROW * len(recording.labels) + 0.1,
+    ]
     colours = dict(zip(recording.labels, cycle(MARKER_COLOURS), strict=False))
     with mpl.rc_context(STYLE):
         figure = new_figure(sum(heights) + 1.0)
-        *rows, last = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+        *rows, last = figure.subplots(
+            len(heights), 1, sharex=True, squeeze=False, height_ratios=heights
+        )[:, 0]
         for axes, panel in zip(rows, panels, strict=True):
             for marker in result.markers:
                 if marker.label in several and marker.still == (panel == "still"):
                     _draw_marker(axes, panel, recording, bridged, marker, colours[marker.label])
             axes.set_ylabel("distance [mm]" if panel == "still" else f"{panel} [mm]")
             axes.yaxis.set_major_locator(MaxNLocator(4))
-            titles = {"x": "Markers, from their median position", "still": "Markers that should not move"}
+            titles = {
+                "x": "Markers, from their median position",
+                "still": "Markers that should not move",
+            }
             axes.set_title(titles.get(panel, ""))
             if result.release_frame is not None:
                 released = result.release_frame / result.rate_hz
                 axes.axvline(released, color=TONES["ink"].light, linewidth=0.9, linestyle="--")
         _draw_seen(last, recording, bridged, result)
-        last.set_xlabel("time [s]; dashed: motion starts" if result.release_frame is not None else "time [s]")
+        last.set_xlabel(
+            "time [s]; dashed: motion starts" if result.release_frame is not None else "time [s]"
+        )
         last.set_xlim(0.0, len(recording.positions) / recording.rate)
-        handles = [mpl.lines.Line2D([], [], color=colour, label=label) for label, colour in colours.items()]
+        handles = [
+            mpl.lines.Line2D([], [], color=colour, label=label) for label, colour in colours.items()
+        ]
         columns = min(len(handles), _LEGEND_COLUMNS)
         figure.legend(handles=handles, loc="outside upper left", ncols=columns, columnspacing=1.4)
         figure.align_ylabels(rows)
@@ -105,7 +132,12 @@ def recording_quality(recording: Recording, result: Quality) -> Figure:
 
 
 def _draw_marker(
-    axes: Axes, panel: str, recording: Recording, bridged: Recording, marker: MarkerQuality, colour: str
+    axes: Axes,
+    panel: str,
+    recording: Recording,
+    bridged: Recording,
+    marker: MarkerQuality,
+    colour: str,
 ) -> None:
     """Draws a marker in a panel: thin where gaps were filled, with a triangle at each jump."""
     column = recording.labels.index(marker.label)
@@ -117,7 +149,13 @@ def _draw_marker(
     axes.plot(time, np.where(recording.seen[:, column], path, np.nan), color=colour, linewidth=1.1)
     frames = [jump.frame for jump in marker.jumps]
     axes.plot(
-        time[frames], path[frames], "v", color=colour, markersize=4.5, markeredgecolor="white", markeredgewidth=0.4
+        time[frames],
+        path[frames],
+        "v",
+        color=colour,
+        markersize=4.5,
+        markeredgecolor="white",
+        markeredgewidth=0.4,
     )
 
 
@@ -128,26 +166,32 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
         The table and the warnings, as text.
 
     Raises:
-        ResphysError: a value in the configuration cannot be used, a recording cannot be read, or a marker on the base
-            was moved between two recordings.
+        ResphysError: a value in the configuration cannot be used, a recording cannot be read, or a
+            marker on the base was moved between two recordings.
     """
     still, longest_gap = settings.still, settings.longest_gap
     if settings.compare_with and len(still) < 2:
-        raise InputError("compare_with needs two or more markers on the base to compare: name them in still.")
+        raise InputError(
+            "compare_with needs two or more markers on the base to compare: name them in still."
+        )
     configured = settings.recording.arguments()
     recordings = [str(settings.recording.path), *settings.compare_with]
     recording, *others = [read_recording(**{**configured, "path": path}) for path in recordings]
     if not recording.labels:
         known = listed([*recording.loads])
         raise DataFileError(
-            f"{recording.source} has no markers, whose quality is examined, but force sensors alone ({known}): read it "
-            "in Python, or convert it."
+            f"{recording.source} has no markers, whose quality is examined, but force sensors "
+            f"alone ({known}): read it in Python, or convert it."
         )
     release = release_of(recording, settings.moving, longest_gap) if settings.moving else None
-    result = quality(recording, still, release, longest_gap=longest_gap, least_jump=settings.least_jump)
+    result = quality(
+        recording, still, release, longest_gap=longest_gap, least_jump=settings.least_jump
+    )
     trials = [recording, *others]
     moved = zip(trials[1:], *compare_base(trials, still), strict=True) if len(trials) > 1 else ()
-    motions = [(trial.source, _MILLI * shift, _MILLI * distortion) for trial, shift, distortion in moved]
+    motions = [
+        (trial.source, _MILLI * shift, _MILLI * distortion) for trial, shift, distortion in moved
+    ]
     figure = recording_quality(recording, result)
     base = [
         {
@@ -166,11 +210,16 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
     heads = ["marker", *(column.lower() for column in QUALITY_COLUMNS)]
     lines = [aligned([heads, *([label, *cells] for label, cells in table.items())])]
     seconds = result.frames / result.rate_hz
-    lines.append(f"{result.source}: {result.frames} frames, {seconds:.2f} s at {result.rate_hz:g} Hz")
+    lines.append(
+        f"{result.source}: {result.frames} frames, {seconds:.2f} s at {result.rate_hz:g} Hz"
+    )
     lines += [f"Force sensor {name}: {_ranges(loads)}." for name, loads in recording.loads.items()]
     if release is not None:
         rest = release.rest
-        lines.append(f"Motion starts in frame {release.frame:.2f}; still in frames {rest[0]} to {rest[1] - 1}.")
+        lines.append(
+            f"Motion starts in frame {release.frame:.2f}; "
+            f"still in frames {rest[0]} to {rest[1] - 1}."
+        )
     lines += result.warnings
     lines += [
         f"{source}: the base is shifted by up to {shift.max():.2f} mm; its markers moved by up to "
@@ -183,7 +232,9 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
 def _ranges(loads: FloatArray) -> str:
     """Returns the range of each measured axis of readings (T, 6)."""
     read = {axis: column[np.isfinite(column)] for axis, column in zip(AXES, loads.T, strict=True)}
-    known = [f"{axis} {x.min():.3g} to {x.max():.3g} {UNITS[axis]}" for axis, x in read.items() if len(x)]
+    known = [
+        f"{axis} {x.min():.3g} to {x.max():.3g} {UNITS[axis]}" for axis, x in read.items() if len(x)
+    ]
     return ", ".join(known) or "no reading"
 
 
@@ -201,7 +252,9 @@ def _draw_seen(axes: Axes, recording: Recording, bridged: Recording, result: Qua
     axes.imshow(image, extent=extent, aspect="auto", interpolation="nearest")
     for row, marker in enumerate(result.markers):
         at = [(jump.frame + 0.5) / recording.rate for jump in marker.jumps]
-        axes.plot(at, [row] * len(at), "|", color=TONES["ink"].light, markersize=6, markeredgewidth=0.9)
+        axes.plot(
+            at, [row] * len(at), "|", color=TONES["ink"].light, markersize=6, markeredgewidth=0.9
+        )
     for row in range(1, height):
         axes.axhline(row - 0.5, color="white", linewidth=1.2)
     axes.set_title("Seen by the cameras")
@@ -210,7 +263,9 @@ def _draw_seen(axes: Axes, recording: Recording, bridged: Recording, result: Qua
     axes.grid(visible=False)
     handles: list[Artist] = [Patch(color=colour, label=name) for name, colour in _STATES.items()]
     handles.append(axes.plot([], [], "|", color=TONES["ink"].light, markersize=6, label="jump")[0])
-    axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, handlelength=1.0)
+    axes.legend(
+        handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, handlelength=1.0
+    )
 
 
 class Conversion(Settings):
@@ -234,10 +289,15 @@ def convert(settings: Conversion, folder: Path) -> None:
     places = {path: Path(settings.to).expanduser() / f"{path.stem}.h5" for path in files}
     if len({*places.values()}) < len(files):
         twice = [str(path) for path in files if [*places.values()].count(places[path]) > 1][:2]
-        raise InputError(f"{' and '.join(twice)} would both be {places[Path(twice[0])]}: convert them to two folders.")
+        raise InputError(
+            f"{' and '.join(twice)} would both be {places[Path(twice[0])]}: "
+            "convert them to two folders."
+        )
     for path, place in places.items():
         if place.exists() and place.samefile(path):
-            raise InputError(f"{path} would be replaced by itself: choose another folder, as in to=converted.")
+            raise InputError(
+                f"{path} would be replaced by itself: choose another folder, as in to=converted."
+            )
         recording = read_recording(**{**settings.recording.arguments(), "path": path})
         write_recording(place, recording)
         frames, channels = len(recording.positions), recording.actuation
@@ -245,8 +305,8 @@ def convert(settings: Conversion, folder: Path) -> None:
         sensors = f", force sensors {listed([*recording.loads])}" if recording.loads else ""
         seen = f", seen {recording.seen.mean():.1%}" if recording.labels else ""
         print(
-            f"{path} -> {place}: {frames} frames at {recording.rate:g} Hz, markers {listed(recording.labels)}{inputs}"
-            f"{sensors}{seen}"
+            f"{path} -> {place}: {frames} frames at {recording.rate:g} Hz, markers "
+            f"{listed(recording.labels)}{inputs}{sensors}{seen}"
         )
 
 
@@ -256,7 +316,11 @@ def _recordings(files: Sequence[str]) -> Iterator[Path]:
         if not path.is_dir() or is_bag(path):
             yield path
             continue
-        inside = sorted(file for file in path.iterdir() if file.suffix.lower() in READERS or is_bag(file))
+        inside = sorted(
+            file for file in path.iterdir() if file.suffix.lower() in READERS or is_bag(file)
+        )
         if not inside:
-            raise DataFileError(f"{path} has no recordings that can be read: name a folder with recordings.")
+            raise DataFileError(
+                f"{path} has no recordings that can be read: name a folder with recordings."
+            )
         yield from inside

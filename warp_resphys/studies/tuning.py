@@ -1,8 +1,8 @@
 """The command `tune`: settings of a network and its training, searched with Optuna.
 
-The objective is the roll-out error on the validation split. The study is in tune.db in the run folder, so that the same
-command continues a search, also beside other processes. Settings that are not searched are part of the study's name:
-other settings begin another study in the same file.
+The objective is the roll-out error on the validation split. The study is in tune.db in the run
+folder, so that the same command continues a search, also beside other processes. Settings that are
+not searched are part of the study's name: other settings begin another study in the same file.
 """
 
 import hashlib
@@ -44,8 +44,12 @@ class Tune(Settings):
     model: Word = setting(description="resphys or simfree")
     trials: Natural = setting(description="finished trials, over all processes")
     seed: Count = setting(0, "of the search; the trials train with the seed of the run")
-    space: dict[str, dict[str, Any]] = setting(description="lists of values, or ranges {low: .., high: .., log: ..}")
-    settings: dict[str, dict[str, Any]] = setting({}, "of all trials, where they differ from those of the run")
+    space: dict[str, dict[str, Any]] = setting(
+        description="lists of values, or ranges {low: .., high: .., log: ..}"
+    )
+    settings: dict[str, dict[str, Any]] = setting(
+        {}, "of all trials, where they differ from those of the run"
+    )
 
 
 class TunedRun(RunSettings):
@@ -55,7 +59,8 @@ class TunedRun(RunSettings):
 
 
 def tune(settings: TunedRun, folder: Path) -> None:
-    """Runs trials until the study has the configured number of them, and prints the best settings as overrides.
+    """Runs trials until the study has the configured number of them,
+    and prints the best settings as overrides.
 
     Raises:
         InputError: a value that cannot be used.
@@ -74,11 +79,21 @@ def tune(settings: TunedRun, folder: Path) -> None:
     *before, trained = (stage for name, stage in stages.items() if name in wanted)
     run_stages(before, folder, wait=True)
     experiment = Experiment(trained.settings, folder)
-    conditions = [training.plain(), str(space), *(stage.settings.content() for stage in (*before, trained))]
-    name = f"{search.model} {hashlib.sha256(json.dumps(conditions, sort_keys=True).encode()).hexdigest()[:12]}"
+    conditions = [
+        training.plain(),
+        str(space),
+        *(stage.settings.content() for stage in (*before, trained)),
+    ]
+    name = (
+        f"{search.model} "
+        f"{hashlib.sha256(json.dumps(conditions, sort_keys=True).encode()).hexdigest()[:12]}"
+    )
 
     def error_mm(trial: Trial) -> float:
-        """Trains with the settings of a trial, and returns its error; infinite where every roll-out diverged."""
+        """Trains with the settings of a trial, and returns its error.
+
+        Infinite where every roll-out diverged.
+        """
 
         def watch(record: Mapping[str, float]) -> None:
             if "rollout_error_mm" in record:
@@ -97,13 +112,17 @@ def tune(settings: TunedRun, folder: Path) -> None:
         return trainer.best_error if math.isfinite(trainer.best_error) else math.inf
 
     try:
-        study = optuna.create_study(storage=f"sqlite:///{folder / 'tune.db'}", study_name=name, load_if_exists=True)
+        study = optuna.create_study(
+            storage=f"sqlite:///{folder / 'tune.db'}", study_name=name, load_if_exists=True
+        )
         study.sampler = optuna.samplers.TPESampler(seed=search.seed + len(study.trials))
         if len(study.get_trials(deepcopy=False, states=_FINISHED)) < search.trials:
             study.optimize(error_mm, callbacks=[MaxTrialsCallback(search.trials, _FINISHED)])
         _print(study, search)
     except (SQLAlchemyError, StorageInternalError) as error:
-        raise DataFileError(f"cannot use {folder / 'tune.db'} ({error}): make it writable, or delete it.") from error
+        raise DataFileError(
+            f"cannot use {folder / 'tune.db'} ({error}): make it writable, or delete it."
+        ) from error
 
 
 def _checked(run: RunSettings, search: Tune) -> tuple[dict[str, Any], TrainingSettings]:
@@ -115,29 +134,41 @@ def _checked(run: RunSettings, search: Tune) -> tuple[dict[str, Any], TrainingSe
     trains = run.ablation is None and run.reconstruction is not None
     learned = [model for model in run.models if model in LEARNED] if trains else []
     if search.model not in learned:
-        raise InputError(f"tune.model is {search.model!r}: the experiment {run.name} trains {listed(learned)}.")
+        raise InputError(
+            f"tune.model is {search.model!r}: the experiment {run.name} trains {listed(learned)}."
+        )
     if folds_of(run) is not None:
         raise InputError(
-            "a search needs one split, and data.folds makes several: set data.folds to null, and data.train, "
-            "data.validation and data.test."
+            "a search needs one split, and data.folds makes several: set data.folds to null, and "
+            "data.train, data.validation and data.test."
         )
-    training, fixed, space = run.training_of(search.model), _dotted(search.settings), _dotted(search.space)
+    training = run.training_of(search.model)
+    fixed = _dotted(search.settings)
+    space = _dotted(search.space)
     if not space:
-        raise InputError("tune.space is empty: it must name at least one setting, such as network.width.")
+        raise InputError(
+            "tune.space is empty: it must name at least one setting, such as network.width."
+        )
     groups = ("network", "trainer" if training.in_the_loop is None else "in_the_loop")
     if unused := [key for key in (*fixed, *space) if key.partition(".")[0] not in groups]:
-        raise InputError(f"the trials do not depend on tune's {unused[0]}: search {' and '.join(groups)} only.")
+        raise InputError(
+            f"the trials do not depend on tune's {unused[0]}: search {' and '.join(groups)} only."
+        )
     with naming("tune: "):
         training = _changed(training, fixed)
     for key, values in space.items():
         try:
-            ends = values if isinstance(values, list) and len(values) > 1 else (values["low"], values["high"])
+            ends = (
+                values
+                if isinstance(values, list) and len(values) > 1
+                else (values["low"], values["high"])
+            )
             for value in ends:
                 _suggest(FixedTrial({key: value}), key, values)
         except (TypeError, ValueError, KeyError) as error:
             raise InputError(
-                f"tune.space.{key} is {values}: write two or more values, as in [8, 16], or a range, as in "
-                "{low: 1.0e-4, high: 1.0e-2, log: true}."
+                f"tune.space.{key} is {values}: write two or more values, as in [8, 16], or a "
+                "range, as in {low: 1.0e-4, high: 1.0e-2, log: true}."
             ) from error
         for value in ends:
             with naming("tune: "):
@@ -147,7 +178,11 @@ def _checked(run: RunSettings, search: Tune) -> tuple[dict[str, Any], TrainingSe
 
 def _dotted(groups: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Settings by dotted key, such as network.width."""
-    return {f"{group}.{name}": value for group, values in groups.items() for name, value in values.items()}
+    return {
+        f"{group}.{name}": value
+        for group, values in groups.items()
+        for name, value in values.items()
+    }
 
 
 def _suggest(trial: BaseTrial, key: str, values: Any) -> Any:
@@ -169,19 +204,25 @@ def _changed(training: TrainingSettings, changes: Mapping[str, Any]) -> Training
 
 def _print(study: optuna.Study, search: Tune) -> None:
     """Prints the best trials, and the command of a run with the settings of the best one."""
-    done = [trial for trial in study.get_trials(states=[TrialState.COMPLETE]) if trial.value != math.inf]
+    done = [
+        trial for trial in study.get_trials(states=[TrialState.COMPLETE]) if trial.value != math.inf
+    ]
     if not done:
         raise InputError("every trial diverged: choose a tune.space closer to settings that work.")
     done.sort(key=lambda trial: (trial.value, trial.number))
     headings = ["trial", "error [mm]", *(key.rpartition(".")[2] for key in done[0].params)]
     rows = [
-        [str(trial.number), number_text(trial.value), *map(_text, trial.params.values())] for trial in done[:_SHOWN]
+        [str(trial.number), number_text(trial.value), *map(_text, trial.params.values())]
+        for trial in done[:_SHOWN]
     ]
     table = PageTable.plain("Best trials: roll-out error on the validation split", headings, rows)
     overrides = [override.lstrip("+") for override in HydraConfig.get().overrides.task]
     kept = [override for override in overrides if not override.lstrip("~").startswith("tune.")]
     prefix = "simfree." if search.model == "simfree" else ""
-    found = [f"{prefix}{key}={value}" for key, value in (_dotted(search.settings) | done[0].params).items()]
+    found = [
+        f"{prefix}{key}={value}"
+        for key, value in (_dotted(search.settings) | done[0].params).items()
+    ]
     show(table, f"A run with the best settings: {shlex.join(['warp-resphys', *kept, *found])}")
 
 

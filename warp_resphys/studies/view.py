@@ -39,10 +39,16 @@ _HAND: Final = "hand"
 _BY_HAND: Final = "by hand"
 _EVERYWHERE: Final = ("0.0.0.0", "::")  # Hosts that stand for all addresses of a machine.
 _DOT: Final = 0.02  # Radius of a marker's dot, over the size of the body.
-_HELP: Final = """Drag the body to pull it, drag beside it to turn the view, scroll to zoom, right-drag to move.
-Keys: **space** pauses, **R** resets."""
-_HELP_TWIN: Final = """Blue: the estimate. Grey: where the robot will be, if its commands stay. Dots: measured markers.
-Drag to turn the view, scroll to zoom, right-drag to move. Keys: **space** pauses, **R** starts again."""
+_HELP: Final = (
+    "Drag the body to pull it, drag beside it to turn the view, scroll to zoom, right-drag to move."
+    "\nKeys: **space** pauses, **R** resets."
+)
+_HELP_TWIN: Final = (
+    "Blue: the estimate. Grey: where the robot will be, if its commands stay. Dots: measured "
+    "markers.\n"
+    "Drag to turn the view, scroll to zoom, right-drag to move. "
+    "Keys: **space** pauses, **R** starts again."
+)
 _SPEEDS: Final = {"a tenth": 0.1, "a quarter": 0.25, "half": 0.5, "real time": 1.0, "double": 2.0}
 
 
@@ -76,7 +82,9 @@ def view(settings: ViewSettings, folder: Path) -> None:
     live: LiveRobot | LiveTwin
     if settings.source is not None:
         if settings.trial is not None:
-            raise InputError("trial and source are both given: a twin follows its source; leave trial out.")
+            raise InputError(
+                "trial and source are both given: a twin follows its source; leave trial out."
+            )
         live = LiveTwin(robot, settings.source, settings.twin)
     else:
         live = LiveRobot(robot)
@@ -105,7 +113,10 @@ def view(settings: ViewSettings, folder: Path) -> None:
         pace = "no frames"
         if live.seconds:
             half, most = np.percentile(1e3 * np.array(live.seconds), [50, 99])
-            pace = f"an estimate for a packet in {half:.1f} ms (median), {most:.1f} ms (99th percentile), "
+            pace = (
+                f"an estimate for a packet in {half:.1f} ms (median), "
+                f"{most:.1f} ms (99th percentile), "
+            )
             pace += f"steps of {1e3 * robot.time_step:g} ms"
         show("\n".join(filter(None, [pace, *live.words, live.failure])))
 
@@ -122,15 +133,17 @@ def _free_port(host: str, port: int) -> int:
             tried.bind((host, port))
         except (OSError, OverflowError, UnicodeError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise InputError(f"port {port} of {host} cannot be used ({reason}): choose another, 0 for any.") from None
+            raise InputError(
+                f"port {port} of {host} cannot be used ({reason}): choose another, 0 for any."
+            ) from None
         return int(tried.getsockname()[1])
 
 
 class Page:
     """The page of a robot in a browser.
 
-    The robot is stepped in the thread that calls `run`. Requests of browsers are queued and handled there, before the
-    next picture.
+    The robot is stepped in the thread that calls `run`. Requests of browsers are queued and handled
+    there, before the next picture.
 
     Args:
         server: that serves the page.
@@ -143,13 +156,16 @@ class Page:
         self._lock = threading.Lock()
         self._playing, self._speed, self._stopped = True, 1.0, False
         self._holder: int | None = None  # Client that drags the body.
-        self._shown_now: tuple[object, ...] = (None, None, None)  # State, trial and robot that are shown.
+        # State, trial and robot that are shown.
+        self._shown_now: tuple[object, ...] = (None, None, None)
         self.pictures = 0
         mesh = live.robot.simulator.body.mesh
         self._surface = surface_vertices(mesh)
         self._faces = np.searchsorted(self._surface, boundary_triangles(mesh))
         self._sharp = sharp_edges(mesh.vertices[self._surface], self._faces)
-        self._scene = LiveScene(server, mesh.vertices, np.asarray(live.robot.simulator.gravity, dtype=np.float64))
+        self._scene = LiveScene(
+            server, mesh.vertices, np.asarray(live.robot.simulator.gravity, dtype=np.float64)
+        )
         self._show()
         if isinstance(live, LiveRobot):
             self._set_dragging(live)
@@ -158,10 +174,17 @@ class Page:
     # Scene
 
     def _layers(self) -> dict[str, Layer]:
-        """Returns the layers of the scene as it is now, by name, in metres; those without points are not shown."""
+        """Returns the layers of the scene as it is now, by name, in metres.
+
+        Those without points are not shown.
+        """
         live = self._live
-        around = ObstacleSurface.of(live.robot.simulator.body, live.robot.parameters).moved(live.moved)
-        body, edges = body_layers(live.positions[self._surface], self._faces, 0.0, sharp=self._sharp)
+        around = ObstacleSurface.of(live.robot.simulator.body, live.robot.parameters).moved(
+            live.moved
+        )
+        body, edges = body_layers(
+            live.positions[self._surface], self._faces, 0.0, sharp=self._sharp
+        )
         solid = obstacle_layers(around.points, around.triangles)
         measured, none = live.measured, np.empty((0, 3))
         target = none if live.target is None else live.target[self._surface]
@@ -169,10 +192,15 @@ class Page:
         return {
             "body": replace(body, colour=TONES["resphys"].dark),
             "edges": edges,
-            "measured body": Layer("surface", target, self._faces, TONES["target"].light, opacity=0.4),
+            "measured body": Layer(
+                "surface", target, self._faces, TONES["target"].light, opacity=0.4
+            ),
             "markers": Layer("balls", live.markers, colour=TONES["resphys"].light, size=1.4 * _DOT),
             "measured": Layer("balls", seen, colour=MEASURED, size=_DOT),
-            **{f"obstacles{part}": layer for part, layer in zip(("", " edges"), solid, strict=False)},
+            **{
+                f"obstacles{part}": layer
+                for part, layer in zip(("", " edges"), solid, strict=False)
+            },
         }
 
     def _show(self) -> None:
@@ -194,7 +222,9 @@ class Page:
             self._ask(live.let_go)
 
         @self._scene.handles["body"].on_drag
-        async def _(event: Any) -> None:  # Without awaiting, so that events are handled in their order.
+        async def _(
+            event: Any,
+        ) -> None:  # Without awaiting, so that events are handled in their order.
             if event.phase == "start" and self._holder is None:
                 self._holder = event.client_id
                 self._ask(partial(live.grab, self._scene.real(event.start_position)))
@@ -221,12 +251,16 @@ class Page:
         gui, robot, live = self._server.gui, self._live.robot, self._live
         gui.configure_theme(dark_mode=False, show_logo=False)
         text = _HELP_TWIN if isinstance(live, LiveTwin) else _HELP
-        gui.add_markdown(f"**{_plain(robot.description.name)}**, {robot.description.model}\n\n{text}")
+        gui.add_markdown(
+            f"**{_plain(robot.description.name)}**, {robot.description.model}\n\n{text}"
+        )
         self._status = gui.add_markdown("")
         self._play = gui.add_button("Pause")
         self._play.on_click(lambda _: self._ask(self._toggle))
         gui.add_button("Reset").on_click(lambda _: self._ask(self._reset))
-        gui.add_command("Pause or go on", hotkey="space").on_trigger(lambda _: self._ask(self._toggle))
+        gui.add_command("Pause or go on", hotkey="space").on_trigger(
+            lambda _: self._ask(self._toggle)
+        )
         gui.add_command("Reset", hotkey="R").on_trigger(lambda _: self._ask(self._reset))
         speed = gui.add_dropdown("Speed", tuple(_SPEEDS), initial_value="real time")
         speed.on_update(lambda _: setattr(self, "_speed", _SPEEDS[speed.value]))
@@ -242,10 +276,16 @@ class Page:
         gui, robot = self._server.gui, live.robot
         if robot.folder is not None:
             name = _BY_HAND if live.trial is None else live.trial.name
-            self._trial = gui.add_dropdown("Motion", (_BY_HAND, *trial_names(robot)), initial_value=name)
+            self._trial = gui.add_dropdown(
+                "Motion", (_BY_HAND, *trial_names(robot)), initial_value=name
+            )
             self._trial.on_update(lambda _: self._ask(partial(self._choose, live)))
         for name, robot_input in robot.inputs.items():
-            words = f"{robot_input.quantity.plural or robot_input.name}".capitalize() if name != BASE else "Base"
+            words = (
+                f"{robot_input.quantity.plural or robot_input.name}".capitalize()
+                if name != BASE
+                else "Base"
+            )
             with gui.add_folder(words, expand_by_default=robot_input.low is not None):
                 for part in range(len(robot_input.parts)):
                     self._sliders[name, part] = self._slider(live, name, part)
@@ -265,14 +305,21 @@ class Page:
         """Returns a slider for a part of an input, in the unit of its quantity for display."""
         robot_input = live.robot.inputs[name]
         quantity = robot_input.quantity
-        unit = ("m" if part < 3 else "rad") if name == BASE else quantity.shown_unit or robot_input.unit
+        unit = (
+            ("m" if part < 3 else "rad")
+            if name == BASE
+            else quantity.shown_unit or robot_input.unit
+        )
         low, high = (quantity.shown_factor * float(limit[part]) for limit in live.limits[name])
         high = high if high > low else low + 1.0
         label = f"{robot_input.parts[part].replace('_', ' ')} [{unit}]"
-        slider = self._server.gui.add_slider(label, low, high, (high - low) / 500.0, min(max(0.0, low), high))
+        slider = self._server.gui.add_slider(
+            label, low, high, (high - low) / 500.0, min(max(0.0, low), high)
+        )
 
         def by_hand() -> None:
-            live.set_input(name, part, slider.value / quantity.shown_factor)  # The value when it is handled.
+            # The value when it is handled.
+            live.set_input(name, part, slider.value / quantity.shown_factor)
             if self._trial is not None and self._trial.value != _BY_HAND:
                 self._trial.value = _BY_HAND
 
@@ -316,14 +363,19 @@ class Page:
         if isinstance(self._live, LiveRobot):
             for (name, part), slider in self._sliders.items():
                 factor = self._live.robot.inputs[name].quantity.shown_factor
-                value = float(np.clip(factor * self._live.inputs[name][part], slider.min, slider.max))
+                value = float(
+                    np.clip(factor * self._live.inputs[name][part], slider.min, slider.max)
+                )
                 if abs(value - slider.value) > 0.5 * slider.step:
                     slider.value = value
 
     # Time
 
     def run(self, seconds: float | None) -> float:
-        """Simulates and draws until it is interrupted or some seconds are over; returns pictures a second."""
+        """Simulates and draws until it is interrupted or some seconds are over.
+
+        Returns pictures a second.
+        """
         live, began, last, updated = self._live, time.perf_counter(), time.perf_counter(), 0.0
         due, simulated, counted = 0.0, 0.0, 0
         try:
@@ -336,7 +388,10 @@ class Page:
                         request()
                     except ResphysError as error:
                         live.failure = str(error)
-                due = min(due + (now - last) * self._speed, 2.0 * max(self._speed / _RATE, live.robot.time_step))
+                due = min(
+                    due + (now - last) * self._speed,
+                    2.0 * max(self._speed / _RATE, live.robot.time_step),
+                )
                 last = now
                 while self._playing and due >= live.robot.time_step and live.step():
                     due -= live.robot.time_step
@@ -347,7 +402,9 @@ class Page:
                 counted += 1
                 if now - updated > _STATUS_EVERY:
                     since = now - updated
-                    self._show_status(counted / since if updated else 0.0, simulated / since if updated else 0.0)
+                    self._show_status(
+                        counted / since if updated else 0.0, simulated / since if updated else 0.0
+                    )
                     updated, simulated, counted = now, 0.0, 0
                 time.sleep(max(1.0 / _RATE - (time.perf_counter() - now), 1e-3))
         except KeyboardInterrupt:

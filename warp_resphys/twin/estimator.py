@@ -1,13 +1,14 @@
-r"""The state of a robot, estimated from its markers: what the estimators of the full and the reduced simulator share.
+r"""The state of a robot, estimated from its markers:
+what the estimators of the full and the reduced simulator share.
 
 The simulator carries the mean. The error of the mean is
 
     q - q^ = Phi z + S theta~,   v - v^ = Phi w + S' theta~,
 
-with r shapes Phi, and the derivatives S and S' of the motion by the refined parameters theta. A force on the body,
-which fades, shifts its equilibrium by b; and the markers sit o away from where they are bound. The covariance is that
-of (z, w, b, theta, o): an extended Kalman filter of reduced rank (Pham, Verron and Roubaud, J. Mar. Syst. 16 (1998)
-323).
+with r shapes Phi, and the derivatives S and S' of the motion by the refined parameters theta. A
+force on the body, which fades, shifts its equilibrium by b; and the markers sit o away from where
+they are bound. The covariance is that of (z, w, b, theta, o): an extended Kalman filter of reduced
+rank (Pham, Verron and Roubaud, J. Mar. Syst. 16 (1998) 323).
 """
 
 from abc import ABC, abstractmethod
@@ -26,20 +27,33 @@ from ..robot.robot import Robot
 from ..stepping.state import State
 from .belief import Belief, Correction
 
-# Errors over the size of the body: of a first shape, which may be anything, and so the most that one frame corrects;
-# and of a simulator whose errors are not known, so that a marker further off has jumped or the body is elsewhere.
+# Errors over the size of the body: of a first shape, which may be anything, and so the most that
+# one frame corrects; and of a simulator whose errors are not known, so that a marker further off
+# has jumped or the body is elsewhere.
 _UNKNOWN, _SIMULATOR = 0.1, 0.02
-# Times [s]: after which the force on the body, such as a touch, is another; over which it is judged whether markers
-# stay away or the simulator without markers is better, which is longer than a period of most soft bodies; and after
-# which a refined parameter, such as a stiffness that depends on the temperature, is another.
+# Times [s]: after which the force on the body, such as a touch, is another; over which it is judged
+# whether markers stay away or the simulator without markers is better, which is longer than a
+# period of most soft bodies; and after which a refined parameter, such as a stiffness that depends
+# on the temperature, is another.
 _WANDER, _JUDGED, _FORGET = 1.0, 0.2, 10.0
-_WORSE: Final = 1.5  # errors over those of the simulator without markers, above which this takes over
-_GATE: Final = 6.0  # distance of a marker that has jumped, in deviations; fewer would refuse true errors of the model
-_EXPLAINED: Final = 0.3  # of the distance of markers that jumped, what a motion of the whole body may leave
-_PLACED: Final = 1e-3  # deviation of markers on the body from where they are bound, as measured with a ruler [m]
-_MEDIAN: Final = 2.0 * scipy.special.gammaincinv(1.5, 0.5)  # of chi-squared with three degrees of freedom
-_ADAPTED: Final = 0.2  # power of a frame's share in the variance of steps, so that about five frames count
-_SHAKEN: Final = (0.03, 1000.0)  # range of the factor of that variance: never zero, as no simulator is exact
+_WORSE: Final = (
+    1.5  # errors over those of the simulator without markers, above which this takes over
+)
+# Distance of a marker that has jumped, in deviations; fewer would refuse true errors of the model.
+_GATE: Final = 6.0
+_EXPLAINED: Final = (
+    0.3  # of the distance of markers that jumped, what a motion of the whole body may leave
+)
+_PLACED: Final = (
+    1e-3  # deviation of markers on the body from where they are bound, as measured with a ruler [m]
+)
+# Of chi-squared with three degrees of freedom.
+_MEDIAN: Final = 2.0 * scipy.special.gammaincinv(1.5, 0.5)
+_ADAPTED: Final = (
+    0.2  # power of a frame's share in the variance of steps, so that about five frames count
+)
+# Range of the factor of that variance: never zero, as no simulator is exact.
+_SHAKEN: Final = (0.03, 1000.0)
 _DOUBLINGS: Final = 40  # of the noise of a frame, after which a correction is nothing
 
 
@@ -78,8 +92,16 @@ class TwinEstimator(ABC, Generic[B]):
         noise: float,
     ) -> None:
         if not noise > 0.0:
-            raise InputError(f"noise is {noise:g}: give the deviation of a marker's coordinate in m, more than zero.")
-        self.robot, self.labels, self.time_step, self.inputs = robot, robot.labels, robot.time_step, dict(inputs)
+            raise InputError(
+                f"noise is {noise:g}: give the deviation "
+                "of a marker's coordinate in m, more than zero."
+            )
+        self.robot, self.labels, self.time_step, self.inputs = (
+            robot,
+            robot.labels,
+            robot.time_step,
+            dict(inputs),
+        )
         self.noise, self._names = noise, tuple(prior)
         self._prior = np.array([*prior.values()], dtype=np.float64)
         rest = robot.simulator.rest_positions
@@ -90,10 +112,15 @@ class TwinEstimator(ABC, Generic[B]):
     def _set_noise(self, frequencies: FloatArray, reach: float) -> None:
         """Covariance at the start, and what a step adds to it.
 
-        A force that is as large in all modes bends the body less in the faster ones, by the square of their frequency.
+        A force that is as large in all modes bends the body less in the faster ones, by the square
+        of their frequency.
         """
         h, known = self.time_step, self.robot.description.errors_mm
-        error = _SIMULATOR * self.size if known is None or known["mean"] is None else 1e-3 * known["mean"]
+        error = (
+            _SIMULATOR * self.size
+            if known is None or known["mean"] is None
+            else 1e-3 * known["mean"]
+        )
         less = (frequencies.min() / frequencies) ** 2
         shape, force = _UNKNOWN * self.size / reach * less, error / reach * less
         shaken = force * frequencies * np.sqrt(frequencies.min() * h / (2.0 * np.pi))
@@ -153,15 +180,21 @@ class TwinEstimator(ABC, Generic[B]):
 
     @abstractmethod
     def _seen(self, belief: B, ago: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Markers (M, 3) some time ago [m], their derivatives (M, 3, n), and those (M, 3) without a twin."""
+        """Markers (M, 3) some time ago [m], their derivatives (M, 3, n),
+        and those (M, 3) without a twin.
+        """
 
     @abstractmethod
     def _moved(self, belief: B, z: FloatArray, w: FloatArray, parameters: FloatArray) -> B:
-        """A belief with changes (r,) of coordinates and rates, and parameters (P,), in its state."""
+        """A belief with changes (r,) of coordinates and rates,
+        and parameters (P,), in its state.
+        """
 
     @abstractmethod
     def _furthest(self, belief: B, z: FloatArray, parameters: FloatArray) -> float:
-        """Largest displacement of a vertex by changes (r,) of the coordinates and (P,) of the parameters [m]."""
+        """Largest displacement of a vertex by changes (r,) of the coordinates
+        and (P,) of the parameters [m].
+        """
 
     @abstractmethod
     def _free(self, belief: B) -> B:
@@ -184,7 +217,9 @@ class TwinEstimator(ABC, Generic[B]):
         )
 
     def _propagated(self, belief: B, transition: FloatArray) -> B:
-        """Bias and covariance after a step with a transition (2 r, 3 r) of the errors (z, w) by (z, w, b)."""
+        """Bias and covariance after a step with a transition (2 r, 3 r)
+        of the errors (z, w) by (z, w, b).
+        """
         r = self._modes
         step = np.eye(len(belief.covariance))
         step[: 2 * r, : 3 * r] = transition
@@ -204,7 +239,9 @@ class TwinEstimator(ABC, Generic[B]):
         spread = np.einsum("min,nk,mik->mi", slopes, belief.covariance, slopes, optimize=True)
         return now, np.sqrt(np.maximum(spread, 0.0))
 
-    def correct(self, belief: B, markers: FloatArray, ago: float, passed: float) -> tuple[B, Correction]:
+    def correct(
+        self, belief: B, markers: FloatArray, ago: float, passed: float
+    ) -> tuple[B, Correction]:
         """Conditions a belief on a frame.
 
         Args:
@@ -215,12 +252,14 @@ class TwinEstimator(ABC, Generic[B]):
         """
         now, slopes, free = self._seen(belief, ago)
         seen, residual = np.asarray(np.isfinite(markers).all(axis=1)), markers - now
-        jump = np.linalg.norm(residual - belief.left, axis=1)  # NaN for markers that were never believed: these are.
+        # NaN for markers that were never believed: these are.
+        jump = np.linalg.norm(residual - belief.left, axis=1)
         away = np.full(len(seen), np.nan)
         away[seen] = distances(belief.covariance, slopes[seen], residual[seen], self.noise)
         refused, stays, since = self._judged(away, jump, belief.since, passed)
         off, apart = (np.linalg.norm(markers - points, axis=1) for points in (now, free))
-        moved, restarted = np.zeros_like(refused), bool(seen.sum() > 1 and refused.sum() > 0.5 * seen.sum())
+        moved = np.zeros_like(refused)
+        restarted = bool(seen.sum() > 1 and refused.sum() > 0.5 * seen.sum())
         if restarted or stays.any():
             lost = self._lost(belief)
             change, _ = self._conditioned(lost, slopes[seen], residual[seen])
@@ -249,11 +288,13 @@ class TwinEstimator(ABC, Generic[B]):
     def _judged(
         self, away: FloatArray, jump: FloatArray, since: FloatArray, passed: float
     ) -> tuple[BoolArray, BoolArray, FloatArray]:
-        """Returns which markers (M,) are left out, which of these have stayed away, and the new `Belief.since`.
+        """Returns which markers (M,) are left out, which of these have stayed away,
+        and the new `Belief.since`.
 
         Args:
             away: (M,) `distances`, NaN where a marker is not seen.
-            jump: (M,) how far it has jumped beside what was expected, since it was last believed [m].
+            jump: (M,) how far it has jumped beside what was expected, since it was last believed
+                [m].
             since: (M,) how long each has been left out [s].
             passed: time since the last frame [s].
         """
@@ -264,7 +305,9 @@ class TwinEstimator(ABC, Generic[B]):
     def _compared(
         self, squares: FloatArray, off: FloatArray, apart: FloatArray, passed: float
     ) -> tuple[FloatArray, bool]:
-        """Returns `Belief.squares` after a frame, and whether the simulator without markers is much better."""
+        """Returns `Belief.squares` after a frame, and whether the simulator
+        without markers is much better.
+        """
         seen = np.isfinite(off)
         if not seen.any():
             return squares, False
@@ -273,18 +316,25 @@ class TwinEstimator(ABC, Generic[B]):
         twin, simulator = squares
         return squares, bool(twin > _WORSE**2 * (simulator + 3.0 * self.noise**2))
 
-    def _conditioned(self, belief: B, slopes: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """`conditioned` for markers, with more noise where the shape would change by too much at once."""
+    def _conditioned(
+        self, belief: B, slopes: FloatArray, residual: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """`conditioned` for markers, with more noise
+        where the shape would change by too much at once.
+        """
         deviation, rows = self.noise, slopes.reshape(-1, slopes.shape[2])
         for _ in range(_DOUBLINGS):
             change, covariance = conditioned(belief.covariance, rows, residual.ravel(), deviation)
-            if self._furthest(belief, *self._parts(change)[::3]) <= _UNKNOWN * self.size:  # Vibrations are small.
+            if self._furthest(belief, *self._parts(change)[::3]) <= _UNKNOWN * self.size:
+                # Vibrations are small.
                 return change, covariance
             deviation *= 2.0
         return np.zeros(len(belief.covariance)), belief.covariance
 
     def without_markers(self, belief: B) -> B:
-        """Returns a belief in the state of the simulator that sees no markers, with its errors, and without a force."""
+        """Returns a belief in the state of the simulator that sees no markers,
+        with its errors, and without a force.
+        """
         covariance = self._with_block(belief.covariance, slice(3 * self._modes), self._simulated)
         markers = slice(len(covariance) - belief.places.size, None)
         return replace(
@@ -337,14 +387,18 @@ class TwinEstimator(ABC, Generic[B]):
 
 
 def adapted(before: float, away: FloatArray) -> float:
-    """Adapts `Belief.shaken` to a frame with markers (M,) at some distances from where they were expected, or NaN."""
+    """Adapts `Belief.shaken` to a frame with markers (M,) at some distances
+    from where they were expected, or NaN.
+    """
     if np.isnan(away).all():
         return before
     far = float(np.nanmedian(away)) ** 2 / _MEDIAN
     return float(np.clip(before * far**_ADAPTED, *_SHAKEN))
 
 
-def distances(covariance: FloatArray, slopes: FloatArray, residual: FloatArray, deviation: float) -> FloatArray:
+def distances(
+    covariance: FloatArray, slopes: FloatArray, residual: FloatArray, deviation: float
+) -> FloatArray:
     """Distances (M,) of markers from where they are expected, in standard deviations (Mahalanobis).
 
     Args:
@@ -354,4 +408,6 @@ def distances(covariance: FloatArray, slopes: FloatArray, residual: FloatArray, 
         deviation: of a coordinate [m].
     """
     spread = slopes @ covariance @ slopes.mT + deviation**2 * np.eye(3)
-    return np.sqrt(np.einsum("mi,mi->m", residual, np.linalg.solve(spread, residual[..., None])[..., 0]))
+    return np.sqrt(
+        np.einsum("mi,mi->m", residual, np.linalg.solve(spread, residual[..., None])[..., 0])
+    )

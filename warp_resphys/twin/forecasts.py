@@ -22,8 +22,8 @@ class Estimate:
 
     Attributes:
         time: of the clock of the packets [s].
-        state: of the robot, one environment; its reaction, if there is a simulator, is that of the step that predicted
-            it, without the correction by markers.
+        state: of the robot, one environment; its reaction, if there is a simulator, is that of the
+            step that predicted it, without the correction by markers.
         markers: (M, 3) [m].
         deviations: (M, 3) of their coordinates [m].
         parameters: refined values and their standard deviations, by name.
@@ -42,13 +42,15 @@ class Forecast:
 
     times: FloatArray  # (T + 1,) from the last step on [s]
     markers: FloatArray  # (T + 1, M, 3) [m]
-    deviations: FloatArray  # (M, 3) of the coordinates at the end [m], scaled by the errors of past predictions
+    deviations: FloatArray  # (M, 3) of the end's coordinates [m], scaled by past errors
     state: State  # at the end, one environment
 
 
 @dataclass(frozen=True)
 class Disagreement:
-    """Mean distances of markers from those measured later, over the last predictions; rigid bodies by position [mm].
+    """Mean distances of markers from those measured later, over the last predictions.
+
+    Rigid bodies by position [mm].
 
     Attributes:
         predictions: their number.
@@ -72,7 +74,10 @@ class Disagreement:
 
 
 def mean_mm(off: FloatArray, labels: Sequence[str]) -> float:
-    """Mean length of the offsets (M, 3) [m] of markers and of the positions of rigid bodies [mm]; NaN without one."""
+    """Mean length of the offsets (M, 3) [m] of markers and of the positions of rigid bodies [mm].
+
+    NaN without one.
+    """
     distances = np.linalg.norm(as_markers(off, labels), axis=1)
     seen = np.isfinite(distances)
     return 1e3 * float(distances[seen].mean()) if seen.any() else float("nan")
@@ -111,7 +116,9 @@ class Scores:
         share = (end - time) / (end - before)
         off = frame - ((1.0 - share) * forecast.markers[-1] + share * forecast.markers[-2])
         usable = np.isfinite(off).all(axis=1) & np.isfinite(seen).all(axis=1)
-        twin, held = (mean_mm(np.where(usable[:, None], x, np.nan), self._labels) for x in (off, frame - seen))
+        twin, held = (
+            mean_mm(np.where(usable[:, None], x, np.nan), self._labels) for x in (off, frame - seen)
+        )
         if np.isnan(twin):
             return
         ratio = off[usable] / np.hypot(forecast.deviations[usable], self._noise)
@@ -119,7 +126,10 @@ class Scores:
         self._ratios.append(ratio.ravel())
 
     def disagreement(self, simulator: float) -> Disagreement | None:
-        """Returns mean errors, beside that of the simulator without markers [mm]; None without predictions."""
+        """Returns mean errors, beside that of the simulator without markers [mm].
+
+        None without predictions.
+        """
         if not self._errors:
             return None
         twin, held, covered = np.mean(self._errors, axis=0)

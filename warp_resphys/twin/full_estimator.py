@@ -1,8 +1,9 @@
 """The state of a robot's full simulator, estimated from its markers.
 
-The simulator itself, with its learned force, carries the mean. The shapes are the slowest vibrations about the first
-state. For each refined parameter a robot with another value runs beside, so that the derivatives of the motion by the
-parameters follow by differences (a filter with separate bias: Friedland, IEEE Trans. Autom. Control 14 (1969) 359).
+The simulator itself, with its learned force, carries the mean. The shapes are the slowest
+vibrations about the first state. For each refined parameter a robot with another value runs beside,
+so that the derivatives of the motion by the parameters follow by differences (a filter with
+separate bias: Friedland, IEEE Trans. Autom. Control 14 (1969) 359).
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,8 +32,12 @@ from .tangent import StepTangent, pulled_by, shifted
 
 _MODES: Final = 8  # vibrations in which the state is corrected
 _DIFFERENCE: Final = 0.05  # of the robots that run beside, in deviations of their parameter
-_OPEN: Final = 1e-3  # least distance of a parameter from a bound that it must not reach, over its first value
-_CHANGED: Final = 0.05  # change of a column of the transition after which the next step renews one, too
+_OPEN: Final = (
+    1e-3  # least distance of a parameter from a bound that it must not reach, over its first value
+)
+_CHANGED: Final = (
+    0.05  # change of a column of the transition after which the next step renews one, too
+)
 _LONGEST_PAUSE: Final = 8  # steps
 _SEEN_STEP: Final = 1e-4  # of differences of markers, over the size of the body
 
@@ -41,9 +46,9 @@ _SEEN_STEP: Final = 1e-4  # of differences of markers, over the size of the body
 class FullBelief(Belief):
     """Estimate of the state of a full simulator."""
 
-    state: State  # of 2 + P environments: the estimate, the P with another parameter, and the one without markers
+    state: State  # of 2 + P: the estimate, P with another parameter, one without markers
     transition: FloatArray  # (2 r, 3 r) of the errors (z, w) by (z, w, b) in a step
-    reaction: Reaction | None  # in the step or equilibrium that predicted the state, without corrections
+    reaction: Reaction | None  # in the uncorrected step or equilibrium that predicted the state
     turn: int = 0  # number of the column of it that is renewed next
     pause: int = 1  # steps between two renewals: few while they change the transition
     wait: int = 0  # steps until the next one
@@ -55,42 +60,57 @@ class FullEstimator(TwinEstimator[FullBelief]):
     Args:
         robot: with a simulator.
         inputs: constant commands under which it rests at first.
-        refine: standard deviations of the parameters to refine, by name, in their units; ``payload`` is one of them
-            where the robot has one, and then starts from the first command and ignores later ones.
+        refine: standard deviations of the parameters to refine, by name, in their units;
+            ``payload`` is one of them where the robot has one, and then starts from the first
+            command and ignores later ones.
         noise: standard deviation of a coordinate of a marker [m].
 
     Raises:
-        InputError: an unknown parameter or input; a network in place of the simulator; obstacles that move, or
-            parameters to refine beside obstacles.
+        InputError: an unknown parameter or input; a network in place of the simulator; obstacles
+            that move, or parameters to refine beside obstacles.
         ConvergenceError: there is no equilibrium.
     """
 
-    def __init__(self, robot: Robot, inputs: Mapping[str, Given], refine: Mapping[str, float], noise: float) -> None:
+    def __init__(
+        self, robot: Robot, inputs: Mapping[str, Given], refine: Mapping[str, float], noise: float
+    ) -> None:
         if robot.is_data_driven:
-            raise InputError("a network in the simulator's place cannot be corrected by a force: load another model.")
+            raise InputError(
+                "a network in the simulator's place cannot be corrected by a force: load another "
+                "model."
+            )
         if any(isinstance(energy, SurfaceContact) for energy in robot.simulator.body.energies):
             raise InputError(
-                "a twin cannot follow a robot with contact between surfaces, which its corrections would make cross: "
-                "set self_contact=null."
+                "a twin cannot follow a robot with contact between surfaces, which its "
+                "corrections would make cross: set self_contact=null."
             )
-        contacts = [energy for energy in robot.simulator.body.energies if isinstance(energy, Contact)]
+        contacts = [
+            energy for energy in robot.simulator.body.energies if isinstance(energy, Contact)
+        ]
         if any(contact.moves for contact in contacts):
-            raise InputError("a twin cannot follow a robot with obstacles that move: set moves to false.")
+            raise InputError(
+                "a twin cannot follow a robot with obstacles that move: set moves to false."
+            )
         if contacts and refine:
             raise InputError(
-                "a twin of a robot with obstacles refines no parameters, as a body that lies on one hardly shows them: "
-                "leave refine out."
+                "a twin of a robot with obstacles refines no parameters, as a body that lies on "
+                "one hardly shows them: leave refine out."
             )
         self._refined, self.robot = dict(refine), robot
         named = [name for name in refine if name != PAYLOAD.name or name not in robot.inputs]
         check_names(named, identifiable_parameters(robot.simulator))
         for name, deviation in refine.items():
             if not deviation > 0.0:
-                raise InputError(f"refine.{name} is {deviation:g}: give its standard deviation, which is positive.")
+                raise InputError(
+                    f"refine.{name} is {deviation:g}: "
+                    "give its standard deviation, which is positive."
+                )
         self._known = self._values(inputs)
         resting = at_rest(robot, 1, inputs)
         self.tangent = StepTangent.of(robot, resting, inputs, _MODES)
-        super().__init__(robot, inputs, self._refined, self.tangent.frequencies, self.tangent.size, noise)
+        super().__init__(
+            robot, inputs, self._refined, self.tangent.frequencies, self.tangent.size, noise
+        )
         self._apart = _DIFFERENCE * self._prior
 
     def _values(self, inputs: Mapping[str, Given]) -> FloatArray:
@@ -100,11 +120,13 @@ class FullEstimator(TwinEstimator[FullBelief]):
             if name == PAYLOAD.name:
                 values.append(float(torch.as_tensor(inputs.get(name, 0.0)).sum()))
                 continue
-            known = torch.as_tensor(self.robot.parameters.get(name, simulator.defaults.get(name, ())))
+            known = torch.as_tensor(
+                self.robot.parameters.get(name, simulator.defaults.get(name, ()))
+            )
             if known.numel() != 1:
                 raise InputError(
-                    f"refine names {name!r}, which has no single value in this robot: refine one that it has "
-                    f"identified, {listed([*self.robot.parameters])}, or the payload."
+                    f"refine names {name!r}, which has no single value in this robot: refine one "
+                    f"that it has identified, {listed([*self.robot.parameters])}, or the payload."
                 )
             values.append(float(known))
         return np.array(values, dtype=np.float64)
@@ -117,15 +139,22 @@ class FullEstimator(TwinEstimator[FullBelief]):
         state = at_rest(robot, self._count, acting)
         first = vars(self._first(values))
         return FullBelief(
-            **first, state=state.detach(), transition=self.tangent.transition, reaction=_of(state, range(self._count))
+            **first,
+            state=state.detach(),
+            transition=self.tangent.transition,
+            reaction=_of(state, range(self._count)),
         )
 
     @property
     def _count(self) -> int:
         return 2 + len(self._refined)
 
-    def _at(self, values: FloatArray, inputs: Mapping[str, Given], more: int = 0) -> tuple[Robot, dict[str, Given]]:
-        """The robot with the parameters of all environments, and some more like the first, and its commands."""
+    def _at(
+        self, values: FloatArray, inputs: Mapping[str, Given], more: int = 0
+    ) -> tuple[Robot, dict[str, Given]]:
+        """The robot with the parameters of all environments,
+        and some more like the first, and its commands.
+        """
         table = np.tile(values, (self._count + more, 1))
         table[1 : self._count - 1] += np.diag(self._apart)
         table[self._count - 1] = self._known
@@ -137,9 +166,12 @@ class FullEstimator(TwinEstimator[FullBelief]):
         return self.robot.with_parameters(**changed) if changed else self.robot, acting
 
     @override
-    def advance(self, belief: FullBelief, inputs: Mapping[str, Given], renew: bool = True) -> FullBelief:
+    def advance(
+        self, belief: FullBelief, inputs: Mapping[str, Given], renew: bool = True
+    ) -> FullBelief:
         if renew and not belief.wait:
-            with suppress(ConvergenceError):  # Perhaps of the environments beside it, which renew its derivatives.
+            # Perhaps of the environments beside it, which renew its derivatives.
+            with suppress(ConvergenceError):
                 return self._advanced(belief, inputs, True)
         return self._advanced(belief, inputs, False)
 
@@ -153,12 +185,16 @@ class FullEstimator(TwinEstimator[FullBelief]):
         forces[self._count - 1] = 0.0
         if renew:
             changes = tangent.changes([belief.turn])
-            moved, faster, pulled = (F.pad(change, (0, 0, 0, 0, self._count, 0)) for change in changes)
+            moved, faster, pulled = (
+                F.pad(change, (0, 0, 0, 0, self._count, 0)) for change in changes
+            )
             state = shifted(robot, state.select([*range(self._count), 0, 0]), moved, faster)
             forces += pulled
         after = robot.step(state, **pulled_by(robot, acting, forces))
         state = after.detach()
-        belief = replace(belief, wait=max(belief.wait - 1, 0), reaction=_of(after, range(self._count)))
+        belief = replace(
+            belief, wait=max(belief.wait - 1, 0), reaction=_of(after, range(self._count))
+        )
         if renew:
             belief = self._renewed(belief, state)
             state = state.select(range(self._count))
@@ -169,9 +205,14 @@ class FullEstimator(TwinEstimator[FullBelief]):
         return replace(belief.state.select([0]), reaction=_of(belief, [0]))
 
     def _renewed(self, belief: FullBelief, after: State) -> FullBelief:
-        """Renews a column of the transition from a step of which the last two environments began with its changes."""
-        column = self.tangent.slopes(after.select([self._count, self._count + 1]), [belief.turn])[:, 0]
-        before, transition, r = belief.transition[:, belief.turn], belief.transition.copy(), len(belief.bias)
+        """Renews a column of the transition from a step of
+        which the last two environments began with its changes.
+        """
+        column = self.tangent.slopes(after.select([self._count, self._count + 1]), [belief.turn])
+        column = column[:, 0]
+        before = belief.transition[:, belief.turn]
+        transition = belief.transition.copy()
+        r = len(belief.bias)
         transition[:, belief.turn] = column
         changed = np.abs(column - before)[:r].max() > _CHANGED * np.abs(before)[:r].max()
         pause = 1 if changed else min(2 * belief.pause, _LONGEST_PAUSE)
@@ -185,7 +226,10 @@ class FullEstimator(TwinEstimator[FullBelief]):
         amount = _SEEN_STEP * self.size / tangent.shapes.norm(dim=2).amax(1)
         both = torch.cat([q, q[:1] + amount[:, None, None] * tangent.shapes])
         seen = self.robot.observe(State(both, torch.zeros_like(both))).cpu().double().numpy()
-        now, beside, free, moved = seen[0], seen[1 : self._count - 1], seen[self._count - 1], seen[self._count :]
+        now = seen[0]
+        beside = seen[1 : self._count - 1]
+        free = seen[self._count - 1]
+        moved = seen[self._count :]
         by_z = np.moveaxis((moved - now) / amount.cpu().double().numpy()[:, None, None], 0, 2)
         by_values = np.moveaxis((beside - now) / self._apart[:, None, None], 0, 2)
         parts = [by_z, -ago * by_z, np.zeros_like(by_z), by_values]
@@ -200,7 +244,9 @@ class FullEstimator(TwinEstimator[FullBelief]):
         return replace(belief, state=belief.state.select(last), reaction=_of(belief, last))
 
     @override
-    def _moved(self, belief: FullBelief, z: FloatArray, w: FloatArray, parameters: FloatArray) -> FullBelief:
+    def _moved(
+        self, belief: FullBelief, z: FloatArray, w: FloatArray, parameters: FloatArray
+    ) -> FullBelief:
         state, tangent = belief.state, self.tangent
         if len(self._prior):
             share = state.q.new_tensor((parameters - belief.parameters) / self._apart)
@@ -224,12 +270,16 @@ class FullEstimator(TwinEstimator[FullBelief]):
         known = {**self.robot.simulator.parameters, PAYLOAD.name: PAYLOAD}
         quantities = [known.get(name, Quantity(name, "")) for name in self._refined]
         far = _OPEN * np.maximum(np.abs(self._known), self._prior)
-        low, high = (np.array([getattr(one, end) for one in quantities]) for end in ("lower", "upper"))
+        low, high = (
+            np.array([getattr(one, end) for one in quantities]) for end in ("lower", "upper")
+        )
         return np.clip(parameters, low + far, high - far - self._apart)
 
 
 def at_rest(robot: Robot, batch: int, inputs: Mapping[str, Given]) -> State:
-    """The equilibrium under constant commands, without the learned force where there is none with it."""
+    """The equilibrium under constant commands, without the learned force
+    where there is none with it.
+    """
     try:
         return robot.settle(batch, **inputs)
     except ConvergenceError:
@@ -242,7 +292,10 @@ def _of(one: State | FullBelief, environments: Sequence[int]) -> Reaction | None
 
 
 def _along(rows: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
-    """Moves a tensor of the state along those that run beside, by shares (P,) of the differences; the last stays."""
+    """Moves a tensor of the state along those that run beside, by shares (P,) of the differences.
+
+    The last stays.
+    """
     if not rows.is_floating_point():
         return rows
     step = torch.tensordot(share.to(rows), rows[1 : 1 + len(share)] - rows[:1], dims=1)

@@ -1,4 +1,6 @@
-"""The state of a robot, estimated from its markers on its reduced model: a few milliseconds a frame."""
+"""The state of a robot, estimated from its markers on its reduced model:
+a few milliseconds a frame.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -30,7 +32,8 @@ class ReducedBelief(Belief):
 
 
 class ReducedEstimator(TwinEstimator[ReducedBelief]):
-    """Estimates the state of a robot with its reduced model, in whose coordinates all derivatives are exact.
+    """Estimates the state of a robot with its reduced model,
+    in whose coordinates all derivatives are exact.
 
     Args:
         robot: whose trials are driven by one input.
@@ -39,16 +42,20 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
         noise: standard deviation of a coordinate of a marker [m].
 
     Raises:
-        InputError: the robot cannot be reduced; a parameter to refine, or an input that the model does not have.
+        InputError: the robot cannot be reduced; a parameter to refine, or an input that the model
+            does not have.
         ConvergenceError: there is no equilibrium.
     """
 
     engine = "reduced model"
 
-    def __init__(self, robot: Robot, inputs: Mapping[str, Given], refine: Mapping[str, float], noise: float) -> None:
+    def __init__(
+        self, robot: Robot, inputs: Mapping[str, Given], refine: Mapping[str, float], noise: float
+    ) -> None:
         if refine:
             raise InputError(
-                f"a reduced model has no {next(iter(refine))} to refine: set engine=full, in which a twin refines it."
+                f"a reduced model has no {next(iter(refine))} to refine: set engine=full, in "
+                "which a twin refines it."
             )
         self.model = model = reduced_of(robot)
         self._reader = InputReader(robot.inputs, robot.simulator)
@@ -61,7 +68,11 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
     def faults(self, inputs: Mapping[str, Given]) -> list[str]:
         values = self._commands(inputs)
         beyond = (values < self.model.range[0]) | (values > self.model.range[1])
-        return [f"{self.model.name} beyond that of the trials, and held at their limit"] if beyond.any() else []
+        return (
+            [f"{self.model.name} beyond that of the trials, and held at their limit"]
+            if beyond.any()
+            else []
+        )
 
     def _commands(self, inputs: Mapping[str, Given]) -> FloatArray:
         """Values (n,) of the model's input."""
@@ -70,8 +81,8 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
         for name, value in read.items():
             if bool((value != 0.0).any()):
                 raise InputError(
-                    f"the reduced model has no input but {self.model.name}, and {name} is given: leave it out, or use "
-                    "the full simulator (engine=full)."
+                    f"the reduced model has no input but {self.model.name}, and {name} is given: "
+                    "leave it out, or use the full simulator (engine=full)."
                 )
         return np.asarray(values.double().cpu().numpy())
 
@@ -80,7 +91,9 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
         return np.clip(self._commands(inputs), *self.model.range)
 
     def _rest(self, inputs: Mapping[str, Given]) -> ReducedState:
-        """Two models at rest, as a full twin without the learned force where there is no equilibrium with it."""
+        """Two models at rest, as a full twin without the learned force
+        where there is no equilibrium with it.
+        """
         commands = self._held(inputs)
         try:
             return self.model.rest(commands, 2)
@@ -88,11 +101,15 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
             return replace(self.model, force=None).rest(commands, 2)
 
     @override
-    def begin(self, inputs: Mapping[str, Given], refined: FloatArray | None = None) -> ReducedBelief:
+    def begin(
+        self, inputs: Mapping[str, Given], refined: FloatArray | None = None
+    ) -> ReducedBelief:
         return ReducedBelief(**vars(self._first(np.zeros(0))), state=self._rest(inputs))
 
     @override
-    def advance(self, belief: ReducedBelief, inputs: Mapping[str, Given], renew: bool = True) -> ReducedBelief:
+    def advance(
+        self, belief: ReducedBelief, inputs: Mapping[str, Given], renew: bool = True
+    ) -> ReducedBelief:
         bias = np.stack([belief.bias, np.zeros_like(belief.bias)])
         end, transition = self.model.transition(belief.state, self._held(inputs), bias)
         off = end.z - self.model.static(end.acting)
@@ -105,11 +122,19 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
     def robot_state(self, belief: ReducedBelief) -> State:
         """Returns the estimated state of the robot, in which the material has relaxed."""
         simulator, (rate, *_) = self.robot.simulator, belief.state.v
-        moved, faster = self.model.positions(belief.state)[:1], (self.model.basis @ rate).reshape(1, -1, 3)
-        state = self.robot.state(simulator.rest_positions + simulator.tensor(moved), simulator.tensor(faster))
-        memory = {**state.memory_of(), "left": torch.full_like(state.left, bool(belief.state.left[0]))}
+        moved = self.model.positions(belief.state)[:1]
+        faster = (self.model.basis @ rate).reshape(1, -1, 3)
+        state = self.robot.state(
+            simulator.rest_positions + simulator.tensor(moved), simulator.tensor(faster)
+        )
+        memory = {
+            **state.memory_of(),
+            "left": torch.full_like(state.left, bool(belief.state.left[0])),
+        }
         for key, value in belief.state.memory.items():
-            memory[f"{self.model.name}.{key}"] = simulator.tensor(np.moveaxis(value[..., :1, :], -2, 0).copy())
+            memory[f"{self.model.name}.{key}"] = simulator.tensor(
+                np.moveaxis(value[..., :1, :], -2, 0).copy()
+            )
         return state.with_memory(memory)
 
     @override
@@ -127,7 +152,9 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
         return replace(belief, state=belief.state.select([1, 1]))
 
     @override
-    def _moved(self, belief: ReducedBelief, z: FloatArray, w: FloatArray, parameters: FloatArray) -> ReducedBelief:
+    def _moved(
+        self, belief: ReducedBelief, z: FloatArray, w: FloatArray, parameters: FloatArray
+    ) -> ReducedBelief:
         moved, faster = (np.stack([change, np.zeros_like(change)]) for change in (z, w))
         return replace(belief, state=belief.state.moved(moved, faster, self.time_step))
 

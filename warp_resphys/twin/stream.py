@@ -42,7 +42,8 @@ class Packet:
 
     @classmethod
     def of_text(cls, text: str | bytes) -> Self:
-        """Reads a packet of JSON: ``{"time": 1.25, "markers": {"tip": [x, y, z]}, "inputs": {"pressure": [0, 1e4]}}``.
+        """Reads a packet of JSON: ``{"time": 1.25, "markers": {"tip": [x, y, z]}, "inputs":
+        {"pressure": [0, 1e4]}}``.
 
         `Twin.take` checks its commands.
 
@@ -52,9 +53,13 @@ class Packet:
         try:
             content = json.loads(text)
         except (ValueError, RecursionError) as error:
-            raise InputError(f"a packet is no JSON ({str(error)[:80]}): docs/twin.md describes packets.") from None
+            raise InputError(
+                f"a packet is no JSON ({str(error)[:80]}): docs/twin.md describes packets."
+            ) from None
         if not isinstance(content, dict) or not isinstance(content.get("time"), int | float):
-            raise InputError("a packet has no time: add 'time' in seconds, on one clock for all packets.")
+            raise InputError(
+                "a packet has no time: add 'time' in seconds, on one clock for all packets."
+            )
         for name in content:
             if name not in _FIELDS:
                 raise InputError(f"a packet has the field {name!r}: it may have {listed(_FIELDS)}.")
@@ -63,10 +68,16 @@ class Packet:
                 raise InputError(f"{name} of a packet is no object: give values by name.")
         plan = content.get("plan")
         try:
-            plan = None if plan is None else [(entry["time"], {**entry["inputs"]}) for entry in plan]
+            plan = (
+                None if plan is None else [(entry["time"], {**entry["inputs"]}) for entry in plan]
+            )
         except (TypeError, KeyError):
-            raise InputError("plan of a packet is no list of objects with 'time' and 'inputs'.") from None
-        markers = {label: position_of(place, label) for label, place in content.get("markers", {}).items()}
+            raise InputError(
+                "plan of a packet is no list of objects with 'time' and 'inputs'."
+            ) from None
+        markers = {
+            label: position_of(place, label) for label, place in content.get("markers", {}).items()
+        }
         return cls(content["time"], markers, content.get("inputs", {}), plan)
 
 
@@ -77,11 +88,15 @@ def position_of(place: ArrayLike, label: str) -> NDArray[np.float64]:
         InputError: no position.
     """
     try:
-        position = np.array([np.nan if x is None else float(x) for x in np.ravel(np.asarray(place, dtype=object))])
+        position = np.array(
+            [np.nan if x is None else float(x) for x in np.ravel(np.asarray(place, dtype=object))]
+        )
     except (TypeError, ValueError, OverflowError):
         position = np.empty(0)
     if place is not None and position.shape != (3,):
-        raise InputError(f"a packet has {place!r} as the position of {label!r}: give x, y and z in m.")
+        raise InputError(
+            f"a packet has {place!r} as the position of {label!r}: give x, y and z in m."
+        )
     return position if np.isfinite(position).all() and place is not None else np.full(3, np.nan)
 
 
@@ -95,19 +110,26 @@ def recorded_packets(robot: Robot, path: str | Path) -> Iterator[Packet]:
     markers, recording = robot.description.markers, read_recording(Path(path).expanduser())
     if markers is not None:
         bodies = markers.rigid_bodies.items()
-        recording = with_corners(recording, {name: body.length for name, body in bodies if name in recording.labels})
+        recording = with_corners(
+            recording, {name: body.length for name, body in bodies if name in recording.labels}
+        )
     driven = [name for name in robot.inputs if name in robot.description.seen]
     commands: Iterator[Mapping[str, ArrayLike]] = iter([{}] * len(recording.positions))
     if recording.actuation is not None and driven:
         parts, width = robot.inputs[driven[0]].parts, recording.actuation.shape[1]
         if len(driven) > 1 or width != len(parts):
-            raise InputError(f"{path} has {width} inputs, and {listed(driven)} of the robot has {len(parts)} parts.")
+            raise InputError(
+                f"{path} has {width} inputs, and {listed(driven)} "
+                f"of the robot has {len(parts)} parts."
+            )
         commands = ({driven[0]: row} for row in recording.actuation)
     for time, frame, inputs in zip(recording.time, recording.positions, commands, strict=True):
         yield Packet(float(time), dict(zip(recording.labels, frame, strict=True)), inputs)
 
 
-def frame_of(markers: Mapping[str, ArrayLike] | ArrayLike, numbers: Mapping[str, int], faults: "Faults") -> FloatArray:
+def frame_of(
+    markers: Mapping[str, ArrayLike] | ArrayLike, numbers: Mapping[str, int], faults: "Faults"
+) -> FloatArray:
     """Returns the positions (M, 3) of a frame [m], with NaN for markers that are not seen.
 
     Args:
@@ -129,7 +151,9 @@ def frame_of(markers: Mapping[str, ArrayLike] | ArrayLike, numbers: Mapping[str,
         return frame
     frame = np.asarray(markers, dtype=np.float64)
     if frame.shape != shape:
-        raise InputError(f"a packet has markers of shape {frame.shape}: give {shape}, or positions by name.")
+        raise InputError(
+            f"a packet has markers of shape {frame.shape}: give {shape}, or positions by name."
+        )
     return np.where(np.isfinite(frame).all(axis=1)[:, None], frame, np.nan)
 
 
@@ -150,7 +174,7 @@ class CommandSeries:
         insort(self._entries, (time, commands), key=lambda entry: entry[0])
 
     def at(self, time: float, after: float | None = None) -> dict[str, Given]:
-        """Returns the commands that hold at a time [s], of those that were given after another one."""
+        """Returns commands that hold at a time [s], of those that were given after another one."""
         known = dict[str, Given]()
         for since, commands in self._entries:
             if since <= time + self._rounding and (after is None or since > after):
@@ -158,7 +182,10 @@ class CommandSeries:
         return known
 
     def drop_last(self, time: float) -> bool:
-        """Removes the commands that were given last before a time; returns whether there were any."""
+        """Removes the commands that were given last before a time.
+
+        Returns whether there were any.
+        """
         count = sum(since <= time + self._rounding for since, _ in self._entries)
         del self._entries[max(count - 1, 0) : count]
         return bool(count)
@@ -170,7 +197,10 @@ class CommandSeries:
 
 
 class Faults(Counter[str]):
-    """Numbers of faults by their descriptions; beyond 30 descriptions, the others count together."""
+    """Numbers of faults by their descriptions.
+
+    Beyond 30 descriptions, the others count together.
+    """
 
     def add(self, what: str) -> None:
         """Counts a fault."""
@@ -200,13 +230,17 @@ class Listener:
             host = port = None
         if host is None or port is None or parts.scheme != "udp":
             raise InputError(f"source is {url!r}: give udp://HOST:PORT, as udp://127.0.0.1:9000.")
-        self._socket = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket = socket.socket(
+            socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM
+        )
         self._socket.setblocking(False)
         try:
             self._socket.bind((host, port))
         except OSError as error:
             self._socket.close()
-            raise InputError(f"{url} cannot be listened at ({error.strerror}): choose another port.") from None
+            raise InputError(
+                f"{url} cannot be listened at ({error.strerror}): choose another port."
+            ) from None
         self.address: tuple[str, int] = self._socket.getsockname()[:2]
 
     def packets(self) -> Iterator[Packet]:
@@ -230,7 +264,8 @@ class Alignment:
     """Moves packets from the frame of cameras to that of the robot.
 
     The first frames are registered, as an import does it: by the markers on what holds the robot
-    (`markers.reference`) where three of them are seen, else by all markers of the robot, which rests meanwhile.
+    (`markers.reference`) where three of them are seen, else by all markers of the robot, which
+    rests meanwhile.
 
     Args:
         robot: whose markers they are.
@@ -244,19 +279,21 @@ class Alignment:
         settings = robot.description.markers
         if settings is None or settings.frame == "own" or settings.plane is not None:
             raise InputError(
-                "twin.align is true, but the run's recordings are not in the frame of the body: send markers as its "
-                "trials have them, and set twin.align to false."
+                "twin.align is true, but the run's recordings are not in the frame of the body: "
+                "send markers as its trials have them, and set twin.align to false."
             )
         self._residual = settings.largest_residual
         self._places = dict(zip(robot.labels, at_rest, strict=True)) | {
-            label: np.asarray(place, dtype=np.float64) for label, place in settings.reference.items()
+            label: np.asarray(place, dtype=np.float64)
+            for label, place in settings.reference.items()
         }
         self._reference = tuple(settings.reference)
         self._waiting: list[Packet] = []
         self.transform: RigidTransform | None = None
 
     def moved(self, packet: Packet) -> list[Packet]:
-        """Returns packets in the frame of the robot: none until enough have come, then those that waited, too.
+        """Returns packets in the frame of the robot:
+        none until enough have come, then those that waited, too.
 
         Raises:
             ResphysError: the markers cannot be registered.
@@ -272,7 +309,11 @@ class Alignment:
 
     def _register(self) -> None:
         seen = np.array(
-            [[one.markers.get(label, [np.nan] * 3) for label in self._places] for one in self._waiting if one.markers],
+            [
+                [one.markers.get(label, [np.nan] * 3) for label in self._places]
+                for one in self._waiting
+                if one.markers
+            ],
             dtype=np.float64,
         )
         lost = np.asarray(np.isnan(seen).any(axis=-1).all(axis=0))
@@ -284,7 +325,12 @@ class Alignment:
         nominal = np.stack([*self._places.values()])
         try:
             registration = register_markers(
-                middle, nominal, labels, source="the first frames", largest_residual=self._residual, use=use
+                middle,
+                nominal,
+                labels,
+                source="the first frames",
+                largest_residual=self._residual,
+                use=use,
             )
         except ResphysError:
             self._waiting = []

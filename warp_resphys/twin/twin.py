@@ -28,12 +28,16 @@ _ENGINES: Final[Mapping[str, Engine]] = {"full": FullEstimator, "reduced": Reduc
 _LONGEST_GAP: Final = 2.0  # without a packet, after which the twin starts again [s]
 _STALE: Final = 10  # packets in order, all too old, after which the clock has been set back
 _LATEST: Final = 1e12  # of times [s]
-_FAR: Final = 10.0  # distance of the first markers that hints at another unit, over the size of the body
+_FAR: Final = (
+    10.0  # distance of the first markers that hints at another unit, over the size of the body
+)
 
 
 @dataclass
 class _Interval:
-    """Frames taken during a step, and the beliefs after it: as simulated, and as corrected by the frames."""
+    """Frames taken during a step, and the beliefs after it:
+    as simulated, and as corrected by the frames.
+    """
 
     frames: list[tuple[float, FloatArray]] = field(default_factory=list)
     predicted: Belief | None = None
@@ -46,21 +50,23 @@ class _Interval:
 class Twin:
     """A robot that follows a real one by its markers, and looks ahead.
 
-    Packets may come late: all steps since are computed again, so that the estimate is the one of packets in order.
-    Corrections excite vibrations that the midpoint rule would keep, so that BDF2 steps in its place.
+    Packets may come late: all steps since are computed again, so that the estimate is the one of
+    packets in order. Corrections excite vibrations that the midpoint rule would keep, so that BDF2
+    steps in its place.
 
     Args:
         robot: as `warp_resphys.load` returns it.
         engine: ``full``, its simulator, or ``reduced``, its reduced model.
-        refine: standard deviations of parameters that are refined on the way, by name, in their units.
+        refine: standard deviations of parameters that are refined on the way, by name, in their
+            units.
         horizon: of `ahead` [s].
         patience: how late a packet may come [s].
         noise: standard deviation of a coordinate of a marker [m].
         inputs: commands before the first packet, as for `Robot.step`.
 
     Raises:
-        InputError: no robot; an unknown engine, input or parameter; a value that is not positive; a network in place of
-            the simulator; or a robot that cannot be reduced.
+        InputError: no robot; an unknown engine, input or parameter; a value that is not positive; a
+            network in place of the simulator; or a robot that cannot be reduced.
         ConvergenceError: there is no equilibrium.
     """
 
@@ -75,7 +81,9 @@ class Twin:
         **inputs: Given,
     ) -> None:
         if not isinstance(robot, Robot):
-            raise InputError(f"robot is {robot!r}: give the robot of a run, as warp_resphys.load returns it.")
+            raise InputError(
+                f"robot is {robot!r}: give the robot of a run, as warp_resphys.load returns it."
+            )
         if engine not in _ENGINES:
             raise InputError(f"engine is {engine!r}: choose {' or '.join(_ENGINES)}.")
         for name, value in (("horizon", horizon), ("patience", patience)):
@@ -94,25 +102,33 @@ class Twin:
     def reset(self) -> None:
         """Forgets all packets."""
         self._scores = Scores(self.estimator.noise, self.labels)
-        # Predictions that have not come to their end, with unscaled deviations, and markers seen when they were made.
+        # Predictions that have not come to their end, with unscaled deviations, and markers seen
+        # when they were made.
         self._pending: list[tuple[Forecast, FloatArray]] = []
         self._free: deque[float] = deque(maxlen=REMEMBERED)
         self._counts = Faults()
-        self._commands, self._planned = CommandSeries(self.estimator.inputs, self._h), CommandSeries({}, self._h)
+        self._commands, self._planned = (
+            CommandSeries(self.estimator.inputs, self._h),
+            CommandSeries({}, self._h),
+        )
         self._latest = -np.inf  # time of the newest packet
         self._steps: dict[int, _Interval] = {}
         self._refined: FloatArray | None = None
         self._stale = 0
-        self._simulated, self._done = 0, -1  # last steps that were simulated, and corrected, with all packets
+        # Last steps that were simulated, and corrected, with all packets.
+        self._simulated, self._done = 0, -1
         self._again = self._framed = False
         self._origin = np.nan  # time of the first packet
 
     def __repr__(self) -> str:
-        """Returns a short description: robot, kind of simulator, steps, and times of predictions and packets."""
+        """Returns a short description: robot, kind of simulator,
+        steps, and times of predictions and packets.
+        """
         about, engine = self.estimator.robot.description, self.estimator.engine
         return (
-            f"Twin of {about.name}, {about.model}, by its {engine}: steps of {1e3 * self._h:g} ms, predictions "
-            f"{self.horizon:g} s ahead, {f'last packet at {self._latest:g} s' if self.has_begun else 'no packet yet'}"
+            f"Twin of {about.name}, {about.model}, by its {engine}: steps of {1e3 * self._h:g} "
+            f"ms, predictions {self.horizon:g} s ahead, "
+            f"{f'last packet at {self._latest:g} s' if self.has_begun else 'no packet yet'}"
         )
 
     def _start(self, time: float, commands: dict[str, Given], frame: FloatArray | None) -> None:
@@ -122,7 +138,13 @@ class Twin:
         for interval in self._steps.values():
             self._forget(interval)
         self._latest = time
-        self._origin, self._newest, self._again, self._stale, self._framed = time, 0, False, 0, False
+        self._origin, self._newest, self._again, self._stale, self._framed = (
+            time,
+            0,
+            False,
+            0,
+            False,
+        )
         self._commands = CommandSeries(commands, self._h)
         self._steps = {0: _Interval(predicted=belief)}
         self._simulated, self._done = 0, -1
@@ -130,20 +152,28 @@ class Twin:
 
     # Packets
 
-    def take(self, time: float, markers: Mapping[str, ArrayLike] | ArrayLike | None = None, /, **inputs: Given) -> bool:
+    def take(
+        self,
+        time: float,
+        markers: Mapping[str, ArrayLike] | ArrayLike | None = None,
+        /,
+        **inputs: Given,
+    ) -> bool:
         """Takes a packet: markers seen, and commands that hold from then on.
 
         Args:
             time: when they were seen or commanded, on one clock for all packets [s].
-            markers: positions [m] by name, or (M, 3) in the order of `labels` with NaN for those that were not seen.
+            markers: positions [m] by name, or (M, 3) in the order of `labels` with NaN for those
+                that were not seen.
             inputs: by name, as for `Robot.step`; those that are not given stay.
 
         Returns:
-            Whether it came in time. The markers of a packet older than `patience` are left out, and its commands hold
-            from the oldest step that is still known.
+            Whether it came in time. The markers of a packet older than `patience` are left out, and
+            its commands hold from the oldest step that is still known.
 
         Raises:
-            InputError: no time, or an unknown input or values that it cannot have; the packet is left out.
+            InputError: no time, or an unknown input or values that it cannot have; the packet is
+                left out.
         """
         commands = self._read(time, inputs)
         for fault in self.estimator.faults(commands):
@@ -153,7 +183,10 @@ class Twin:
             self._start(time, {**self._commands.at(np.inf), **commands}, frame)
             commands = {}
         elif frame is not None and not self._framed:
-            self._check_unit(frame, next(one.predicted for one in self._steps.values() if one.predicted is not None))
+            self._check_unit(
+                frame,
+                next(one.predicted for one in self._steps.values() if one.predicted is not None),
+            )
         self._framed = self._framed or frame is not None
         number = int(np.ceil((time - self._origin) / self._h - ROUNDING))
         oldest = max(self._newest - self._keep + 1, 0)
@@ -177,13 +210,17 @@ class Twin:
         return True
 
     def plan(self, commands: Iterable[tuple[float, Mapping[str, Given]]]) -> None:
-        """Announces commands, for predictions only: what acts is what packets say. It replaces the last plan.
+        """Announces commands, for predictions only: what acts is what packets say.
+
+        It replaces the last plan.
 
         Args:
-            commands: times on the clock of the packets [s], and commands by name that will hold from then on.
+            commands: times on the clock of the packets [s], and commands by name that will hold
+                from then on.
 
         Raises:
-            InputError: no time, or an unknown input or values that it cannot have; the last plan stays.
+            InputError: no time, or an unknown input or values that it cannot have; the last plan
+                stays.
         """
         planned = CommandSeries({}, self._h)
         for at, values in commands:
@@ -196,7 +233,10 @@ class Twin:
         return {name: self._reader.read(name, value, 1) for name, value in inputs.items()}
 
     def restart(self, why: str) -> None:
-        """Starts again with the next packet, from rest and with the refined parameters; `counts` has the reason."""
+        """Starts again with the next packet, from rest and with the refined parameters.
+
+        `counts` has the reason.
+        """
         if self.has_begun:
             self._counts.add(f"starts {why}")
             self._again = True
@@ -207,7 +247,9 @@ class Twin:
         return belief
 
     def _is_other_clock(self, time: float) -> bool:
-        """Whether the twin starts again: after a gap, or where the clock of the packets was set back."""
+        """Whether the twin starts again: after a gap,
+        or where the clock of the packets was set back.
+        """
         if self._again:
             return True
         now = self._origin + self._newest * self._h
@@ -225,8 +267,8 @@ class Twin:
         off = np.linalg.norm(frame - self.estimator.markers(belief)[0], axis=1)
         if np.isfinite(off).any() and np.nanmedian(off) > _FAR * self.estimator.size:
             raise InputError(
-                f"the first markers are {np.nanmedian(off):.3g} m from the robot: give positions in metres, in the "
-                "frame of the run's recordings."
+                f"the first markers are {np.nanmedian(off):.3g} m from the robot: give positions "
+                "in metres, in the frame of the run's recordings."
             )
 
     # Estimates
@@ -264,17 +306,25 @@ class Twin:
             try:
                 return self.estimator.advance(belief, commands)
             except ConvergenceError:
-                self._counts.add("failed steps, after which the state was that of the simulator without markers")
+                self._counts.add(
+                    "failed steps, after which the state was that of the simulator without markers"
+                )
                 return self._without_markers(belief, commands)
-            except InputError as error:  # Such as a base that moves too fast: what was commanded last is forgotten.
+            except InputError as error:
+                # Such as a base that moves too fast: what was commanded last is forgotten.
                 if not self._commands.drop_last(start):
                     raise
                 self._counts.add(f"a command was left out: {error}")
 
     def _without_markers(self, belief: Belief, commands: dict[str, Given]) -> Belief:
-        """A step from the state of the simulator without markers; at rest, if that fails as well."""
+        """A step from the state of the simulator without markers.
+
+        At rest, if that fails as well.
+        """
         try:
-            return self.estimator.advance(self.estimator.without_markers(belief), commands, renew=False)
+            return self.estimator.advance(
+                self.estimator.without_markers(belief), commands, renew=False
+            )
         except ConvergenceError:
             return self.estimator.begin(commands, belief.parameters)
 
@@ -282,7 +332,9 @@ class Twin:
         belief, interval.corrections = interval.predicted, []
         assert belief is not None
         end = self._origin + number * self._h
-        interval.before = self._steps[number - 1].last if number - 1 in self._steps else interval.before
+        interval.before = (
+            self._steps[number - 1].last if number - 1 in self._steps else interval.before
+        )
         last = interval.before
         for time, frame in interval.frames:
             passed = self._h if last is None else time - last
@@ -348,15 +400,21 @@ class Twin:
             ConvergenceError: a step failed.
         """
         if seconds is not None and not 0.0 < seconds < np.inf:
-            raise InputError(f"seconds is {seconds}: give the length of the prediction, more than zero.")
+            raise InputError(
+                f"seconds is {seconds}: give the length of the prediction, more than zero."
+            )
         belief = self._belief_at(self._update())
         commands, now = self._commands.at(np.inf), self._origin + self._newest * self._h
-        steps = max(int(np.ceil((self.horizon if seconds is None else seconds) / self._h - ROUNDING)), 1)
+        steps = max(
+            int(np.ceil((self.horizon if seconds is None else seconds) / self._h - ROUNDING)), 1
+        )
 
         def advance(before: Belief, number: int) -> Belief:
             planned = self._planned.at(now + number * self._h, after=self._latest)
             try:
-                return self.estimator.advance(before, {**commands, **planned, **inputs}, renew=False)
+                return self.estimator.advance(
+                    before, {**commands, **planned, **inputs}, renew=False
+                )
             except (ConvergenceError, InputError):
                 self._counts.add("predictions that failed")
                 raise
@@ -367,7 +425,10 @@ class Twin:
         times = now + self._h * np.arange(steps + 1, dtype=np.float64)
         deviations = self.estimator.markers(state)[1]
         prediction = Forecast(
-            times, np.stack(markers), self._scores.scale * deviations, self.estimator.robot_state(state)
+            times,
+            np.stack(markers),
+            self._scores.scale * deviations,
+            self.estimator.robot_state(state),
         )
         seen = self._last_seen()
         if not inputs and seconds is None and seen is not None:
@@ -376,7 +437,9 @@ class Twin:
 
     def _last_seen(self) -> FloatArray | None:
         """Markers (M, 3) as they were last seen [m], NaN where not for `patience`."""
-        frames = [frame for number in sorted(self._steps) for _, frame in self._steps[number].frames]
+        frames = [
+            frame for number in sorted(self._steps) for _, frame in self._steps[number].frames
+        ]
         if not frames:
             return None
         seen = frames[0].copy()

@@ -1,1 +1,3 @@
-"""Measured markers: file readers, occlusions, jumps, detection of the release, and quality of a recording."""
+"""Measured markers: file readers, occlusions, jumps,
+detection of the release, and quality of a recording.
+"""

@@ -1,12 +1,15 @@
-"""Recordings in ROS 1 and 2 bags, also as single MCAP files, read without ROS by the package rosbags.
+"""Recordings in ROS 1 and 2 bags, also as single MCAP files,
+read without ROS by the package rosbags.
 
-Every topic has messages at its own times: those of its headers or, without headers, those at which it was recorded, on
-the clock of the headers, which must be one for all topics, and run. Markers and inputs are brought to common frames:
-markers by linear interpolation, rotations by the shortest turn, and inputs keep their last value.
+Every topic has messages at its own times: those of its headers or, without headers, those at which
+it was recorded, on the clock of the headers, which must be one for all topics, and run. Markers and
+inputs are brought to common frames: markers by linear interpolation, rotations by the shortest
+turn, and inputs keep their last value.
 
-A source is a topic, with a member after # where a message has several: the child frame of a transform (``/tf#tip``),
-the number of a point, a pose or a number in an array, from 1 (``/cloud#3``), or the quantity of a joint
-(``/joint_states#finger.effort``). Those of inputs have their unit in brackets (``/pressure#1 [mbar]``).
+A source is a topic, with a member after # where a message has several: the child frame of a
+transform (``/tf#tip``), the number of a point, a pose or a number in an array, from 1
+(``/cloud#3``), or the quantity of a joint (``/joint_states#finger.effort``). Those of inputs have
+their unit in brackets (``/pressure#1 [mbar]``).
 """
 
 import logging
@@ -43,9 +46,15 @@ def is_bag(path: Path) -> bool:
 
 
 def topics_of(path: Path) -> str:
-    """Returns the topics of a bag and the types of their messages, for a sentence; raises errors as `read_bag`."""
+    """Returns the topics of a bag and the types of their messages, for a sentence.
+
+    Raises errors as `read_bag`.
+    """
     with _opened(path) as reader:
-        return ", ".join(sorted(f"{one.topic} ({one.msgtype})" for one in reader.connections)) or "no topic"
+        return (
+            ", ".join(sorted(f"{one.topic} ({one.msgtype})" for one in reader.connections))
+            or "no topic"
+        )
 
 
 def read_bag(path: Path, bag: BagSettings) -> Recording:
@@ -56,7 +65,8 @@ def read_bag(path: Path, bag: BagSettings) -> Recording:
         bag: which topics are markers, inputs and the base.
 
     Raises:
-        DataFileError: The bag is missing or damaged, lacks a topic, or has messages of a type that cannot be read.
+        DataFileError: The bag is missing or damaged, lacks a topic, or has messages of a type that
+            cannot be read.
         InputError: rosbags is not installed, or a source is misspelt.
     """
     markers = [_Source(path, text, _pose) for text in bag.markers.values()]
@@ -70,10 +80,15 @@ def read_bag(path: Path, bag: BagSettings) -> Recording:
     with _opened(path) as reader:
         there = {connection.topic for connection in reader.connections}
         for topic in sorted({source.topic for source in sources} - there):
-            known = did_you_mean(topic, sorted(there)) or f"; it has {', '.join(sorted(there)) or 'none'}."
+            known = (
+                did_you_mean(topic, sorted(there))
+                or f"; it has {', '.join(sorted(there)) or 'none'}."
+            )
             raise DataFileError(f"{path} has no topic {topic}{known}")
         wanted = {source.topic for source in sources}
-        connections = [connection for connection in reader.connections if connection.topic in wanted]
+        connections = [
+            connection for connection in reader.connections if connection.topic in wanted
+        ]
         for connection, received, data in reader.messages(connections=connections):
             message = reader.deserialize(data, connection.msgtype)
             for source in sources:
@@ -82,14 +97,18 @@ def read_bag(path: Path, bag: BagSettings) -> Recording:
     for source in sources:
         if not source.values:
             named = "" if source.member is None else f" of {source.member}"
-            raise DataFileError(f"{path}: {source.topic} has no message{named}; check what was recorded.")
+            raise DataFileError(
+                f"{path}: {source.topic} has no message{named}; check what was recorded."
+            )
     late = _late(path, sources)
     times, rate = _frames(path, [source.series(late)[0] for source in markers], bag.rate)
     moved = np.stack([_at_frames(*source.series(late), times, rate) for source in markers], 1)
     columns = []
     for source in inputs:
         stamps, values = source.series(late)
-        columns.append(values[np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, None), 0])
+        columns.append(
+            values[np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, None), 0]
+        )
     loads = {name: _between(*source.series(late), times, rate) for name, source in wrenches.items()}
     poses = None if base is None else _at_frames(*base.series(late), times, rate)
     return Recording(
@@ -119,15 +138,16 @@ def _late(path: Path, sources: "Sequence[_Source]") -> float:
         apart = ahead[topic] - ahead[first]
         if np.abs(apart).max() > _SAME_CLOCK:
             raise DataFileError(
-                f"{path}: the headers of {topic} are of another clock than those of {first}: they differ by "
-                f"{apart[0]:.3g} s at the start and {apart[1]:.3g} s at the end; record both with one clock."
+                f"{path}: the headers of {topic} are of another clock than those of {first}: "
+                f"they differ by {apart[0]:.3g} s at the start and {apart[1]:.3g} s at the end; "
+                "record both with one clock."
             )
     drift = float(np.ptp(next(iter(ahead.values()))))
     bare = [source.topic for source in sources if not np.isfinite(source.stamps).any()]
     if bare and drift > _SAME_CLOCK:
         raise DataFileError(
-            f"{path}: {bare[0]} has no headers, and the clock of those of {first} drifts from that of the bag by "
-            f"{drift:.3g} s: record both with one clock."
+            f"{path}: {bare[0]} has no headers, and the clock of those of {first} drifts from "
+            f"that of the bag by {drift:.3g} s: record both with one clock."
         )
     clocks = np.concatenate([np.subtract(source.received, source.stamps) for source in sources])
     return float(np.nanmedian(clocks))
@@ -135,18 +155,26 @@ def _late(path: Path, sources: "Sequence[_Source]") -> float:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Opens a bag; the errors of rosbags for damaged files, of many classes, become a DataFileError."""
+    """Opens a bag.
+
+    The errors of rosbags for damaged files, of many classes, become a DataFileError.
+    """
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise InputError("bags need a package that is not installed: pip install 'warp-resphys[bags]'.") from None
+        raise InputError(
+            "bags need a package that is not installed: pip install 'warp-resphys[bags]'."
+        ) from None
     if not path.exists():
-        raise DataFileError(f"Cannot read {path}: there is no such file or folder; check the path of the recording.")
+        raise DataFileError(
+            f"Cannot read {path}: there is no such file or folder; check the path of the recording."
+        )
     try:
         with TemporaryDirectory() as folder:
             file = Path(folder) / f"bag{path.suffix.lower()}"
-            if path.is_file() and path.suffix != file.suffix:  # rosbags knows extensions in small letters only.
+            if path.is_file() and path.suffix != file.suffix:
+                # Rosbags knows extensions in small letters only.
                 file.symlink_to(path.absolute())
                 path = file
             with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
@@ -155,19 +183,26 @@ def _opened(path: Path) -> Iterator[Any]:
         raise
     except Exception as error:
         what = f"{type(error).__name__}: {error}"
-        raise DataFileError(f"{path} is damaged, or no bag of ROS ({what}): record it with ROS again.") from error
+        raise DataFileError(
+            f"{path} is damaged, or no bag of ROS ({what}): record it with ROS again."
+        ) from error
 
 
 class _Source:
     """A topic, a member of its messages, and their times and values."""
 
-    def __init__(self, path: Path, text: str, read: "Callable[[_Source, str, Any], Sequence[float] | None]") -> None:
+    def __init__(
+        self, path: Path, text: str, read: "Callable[[_Source, str, Any], Sequence[float] | None]"
+    ) -> None:
         match = _SOURCE.fullmatch(text.strip())
         if match is None:
-            raise InputError(f"data.bag names '{text}': write a topic, as /tip, /tf#tip or '/pressure#1 [mbar]'.")
+            raise InputError(
+                f"data.bag names '{text}': write a topic, as /tip, /tf#tip or '/pressure#1 [mbar]'."
+            )
         self.path, self.text, self.topic, self._read = path, text, match["topic"], read
         self.member, self.unit = match["member"], match["unit"] or "1"
-        self.stamps, self.received = list[float](), list[float]()  # s; stamps are NaN without a header
+        # s; stamps are NaN without a header
+        self.stamps, self.received = list[float](), list[float]()
         self.values = list[Sequence[float]]()
 
     def add(self, kind: str, message: Any, received: float) -> None:
@@ -176,7 +211,9 @@ class _Source:
         if value is None:
             return
         if hasattr(message, "transforms"):
-            message = next((tf for tf in message.transforms if tf.child_frame_id == self.member), message)
+            message = next(
+                (tf for tf in message.transforms if tf.child_frame_id == self.member), message
+            )
         header = getattr(message, "header", None)
         stamp = 0.0 if header is None else header.stamp.sec + 1e-9 * header.stamp.nanosec
         self.stamps.append(float(stamp or np.nan))
@@ -184,13 +221,20 @@ class _Source:
         self.values.append(value)
 
     def series(self, late: float) -> tuple[FloatArray, FloatArray]:
-        """Times (n,) [s] that grow, and values (n, ...); ``late`` is the clock of the bag less that of the headers."""
+        """Times (n,) [s] that grow, and values (n, ...).
+
+        ``late`` is the clock of the bag less that of the headers.
+        """
         stamps, received = np.array(self.stamps), np.array(self.received)
-        times, first = np.unique(np.where(np.isfinite(stamps), stamps, received - late), return_index=True)
+        times, first = np.unique(
+            np.where(np.isfinite(stamps), stamps, received - late), return_index=True
+        )
         return times, np.array(self.values, dtype=np.float64)[first]
 
     def ahead(self) -> FloatArray:
-        """Clock of the bag less that of the headers (2,) [s], in the first and last tenth; empty without two headers.
+        """Clock of the bag less that of the headers (2,) [s], in the first and last tenth.
+
+        Empty without two headers.
 
         Raises:
             DataFileError: stamps stand still or fall back.
@@ -206,10 +250,13 @@ class _Source:
         if len(fallen) or 2 * repeated > len(stamps) or counts.max() >= _FROZEN:
             what = f"{repeated} of {len(stamps)} messages repeat the time of another"
             if len(fallen):
-                what = f"the time falls by {stamps[fallen[0]] - stamps[fallen[0] + 1]:.3g} s at message {fallen[0] + 2}"
+                what = (
+                    f"the time falls by {stamps[fallen[0]] - stamps[fallen[0] + 1]:.3g} s at "
+                    f"message {fallen[0] + 2}"
+                )
             raise DataFileError(
-                f"{self.path}: in the headers of {self.topic}, {what}: record it with a clock that runs, or without "
-                "headers."
+                f"{self.path}: in the headers of {self.topic}, {what}: record it with a clock "
+                "that runs, or without headers."
             )
         if repeated:
             log.warning(
@@ -223,14 +270,18 @@ class _Source:
     def number(self) -> int:
         """Number of the entry of its messages, from 1."""
         if self.member is None or not self.member.isdecimal() or int(self.member) < 1:
-            raise InputError(f"data.bag names '{self.text}': say which entry of its messages, as in {self.topic}#1.")
+            raise InputError(
+                f"data.bag names '{self.text}': "
+                f"say which entry of its messages, as in {self.topic}#1."
+            )
         return int(self.member)
 
     def entry(self, values: Sequence[Any]) -> Any:
         """Returns its entry of an array."""
         if self.number > len(values):
             raise DataFileError(
-                f"{self.path}: a message of {self.topic} has {len(values)} entries, but {self.text} is asked for."
+                f"{self.path}: a message of {self.topic} has {len(values)} entries, but "
+                f"{self.text} is asked for."
             )
         return values[self.number - 1]
 
@@ -239,19 +290,26 @@ class _Source:
         """Factor of an input to SI units."""
         if self.unit not in SI_PER_ACTUATION_UNIT:
             units = ", ".join(SI_PER_ACTUATION_UNIT)
-            raise InputError(f"data.bag.inputs has '{self.text}', whose unit is unknown: give one of {units}.")
+            raise InputError(
+                f"data.bag.inputs has '{self.text}', whose unit is unknown: give one of {units}."
+            )
         return SI_PER_ACTUATION_UNIT[self.unit]
 
 
 def _pose(source: _Source, kind: str, message: Any) -> Sequence[float] | None:
-    """Returns a place [m] and a quaternion, w first, NaN without a rotation; None without the member."""
+    """Returns a place [m] and a quaternion, w first, NaN without a rotation.
+
+    None without the member.
+    """
     if kind in _IMAGES:
         raise DataFileError(
-            f"{source.path}: {source.topic} has images: track the markers in them by another program, and give its "
-            "table."
+            f"{source.path}: {source.topic} has images: track the markers in them by another "
+            "program, and give its table."
         )
     if kind == "tf2_msgs/msg/TFMessage":
-        message = next((tf for tf in message.transforms if tf.child_frame_id == source.member), None)
+        message = next(
+            (tf for tf in message.transforms if tf.child_frame_id == source.member), None
+        )
         if message is None:
             return None
     if hasattr(message, "transform"):
@@ -267,8 +325,9 @@ def _pose(source: _Source, kind: str, message: Any) -> Sequence[float] | None:
     if all(isinstance(getattr(message, axis, None), float) for axis in "xyz"):
         return (message.x, message.y, message.z, *[np.nan] * 4)
     raise DataFileError(
-        f"{source.path}: {source.topic} has messages of the type {kind}, which hold no place: markers are poses, "
-        "points, transforms, odometry, arrays of poses and clouds of points in a fixed order."
+        f"{source.path}: {source.topic} has messages of the type {kind}, which hold no place: "
+        "markers are poses, points, transforms, odometry, arrays of poses and clouds of points "
+        "in a fixed order."
     )
 
 
@@ -277,13 +336,22 @@ def _point(source: _Source, message: Any) -> Sequence[float]:
     if source.number > message.width * message.height:
         return (np.nan,) * 7
     fields = {field.name: field for field in message.fields}
-    if not {"x", "y", "z"} <= {*fields} or any(fields[axis].datatype not in _CLOUD_TYPES for axis in "xyz"):
-        raise DataFileError(f"{source.path}: the cloud {source.topic} has no x, y and z as floating-point numbers.")
+    if not {"x", "y", "z"} <= {*fields} or any(
+        fields[axis].datatype not in _CLOUD_TYPES for axis in "xyz"
+    ):
+        raise DataFileError(
+            f"{source.path}: the cloud {source.topic} has no x, y and z as floating-point numbers."
+        )
     row, column = divmod(source.number - 1, message.width)
     first, data = row * message.row_step + column * message.point_step, bytes(message.data)
-    types = [(">" if message.is_bigendian else "<") + _CLOUD_TYPES[fields[axis].datatype] for axis in "xyz"]
+    types = [
+        (">" if message.is_bigendian else "<") + _CLOUD_TYPES[fields[axis].datatype]
+        for axis in "xyz"
+    ]
     starts = [first + fields[axis].offset for axis in "xyz"]
-    point = [float(np.frombuffer(data, kind, 1, at)[0]) for kind, at in zip(types, starts, strict=True)]
+    point = [
+        float(np.frombuffer(data, kind, 1, at)[0]) for kind, at in zip(types, starts, strict=True)
+    ]
     return (*point, *[np.nan] * 4)
 
 
@@ -297,8 +365,8 @@ def _input(source: _Source, kind: str, message: Any) -> Sequence[float] | None:
         joint, _, quantity = (source.member or "").rpartition(".")
         if quantity not in ("position", "velocity", "effort"):
             raise InputError(
-                f"data.bag.inputs has '{source.text}': name the joint and its position, velocity or effort, as in "
-                f"{source.topic}#finger.effort."
+                f"data.bag.inputs has '{source.text}': name the joint and its position, velocity "
+                f"or effort, as in {source.topic}#finger.effort."
             )
         values = dict(zip(message.name, getattr(message, quantity), strict=False))
         return (float(values[joint]),) if joint in values else None
@@ -310,8 +378,8 @@ def _input(source: _Source, kind: str, message: Any) -> Sequence[float] | None:
     if data is not None and kind.endswith("MultiArray"):
         return (float(source.entry(data)),)
     raise DataFileError(
-        f"{source.path}: {source.topic} has messages of the type {kind}, which hold no input: inputs are numbers and "
-        "arrays of numbers (std_msgs), JointState and FluidPressure."
+        f"{source.path}: {source.topic} has messages of the type {kind}, which hold no input: "
+        "inputs are numbers and arrays of numbers (std_msgs), JointState and FluidPressure."
     )
 
 
@@ -320,14 +388,16 @@ def _wrench(source: _Source, kind: str, message: Any) -> Sequence[float]:
     wrench = getattr(message, "wrench", message)
     if not (hasattr(wrench, "force") and hasattr(wrench, "torque")):
         raise DataFileError(
-            f"{source.path}: {source.topic} has messages of the type {kind}, which hold no force: readings of force "
-            "sensors are Wrench and WrenchStamped."
+            f"{source.path}: {source.topic} has messages of the type {kind}, which hold no "
+            "force: readings of force sensors are Wrench and WrenchStamped."
         )
     return [float(getattr(part, axis)) for part in (wrench.force, wrench.torque) for axis in "xyz"]
 
 
 def _between(times: FloatArray, values: FloatArray, frames: FloatArray, rate: float) -> FloatArray:
-    """Values (T, C) at the frames, linear between messages, NaN before the first, after the last, and in gaps."""
+    """Values (T, C) at the frames, linear between messages,
+    NaN before the first, after the last, and in gaps.
+    """
     series = np.stack([np.interp(frames, times, column, np.nan, np.nan) for column in values.T], 1)
     after = np.searchsorted(times, frames).clip(1, max(len(times) - 1, 1))
     if len(times) > 1:
@@ -335,17 +405,23 @@ def _between(times: FloatArray, values: FloatArray, frames: FloatArray, rate: fl
     return series
 
 
-def _frames(path: Path, times: Sequence[FloatArray], rate: float | None) -> tuple[FloatArray, float]:
+def _frames(
+    path: Path, times: Sequence[FloatArray], rate: float | None
+) -> tuple[FloatArray, float]:
     """Times of the frames [s], while all markers have messages, and their rate [Hz]."""
     if rate is None:
         if len(times[0]) < 2:
-            raise DataFileError(f"{path}: the first marker has a single message, which has no rate: set data.bag.rate.")
+            raise DataFileError(
+                f"{path}: the first marker has a single message, "
+                "which has no rate: set data.bag.rate."
+            )
         rate = 1.0 / float(np.median(np.diff(times[0])))
         rate = round(rate) if abs(rate - round(rate)) < 5e-3 * rate else rate
     start, stop = max(stamps[0] for stamps in times), min(stamps[-1] for stamps in times)
     if stop - start < 1.0 / rate:
         raise DataFileError(
-            f"{path}: its markers have no messages at the same time; check the clocks of their headers."
+            f"{path}: its markers have no messages at the same time; "
+            "check the clocks of their headers."
         )
     return start + np.arange(int((stop - start) * rate + 1e-6) + 1) / rate, float(rate)
 
@@ -353,7 +429,8 @@ def _frames(path: Path, times: Sequence[FloatArray], rate: float | None) -> tupl
 def _at_frames(times: FloatArray, poses: FloatArray, frames: FloatArray, rate: float) -> FloatArray:
     """Poses (T, 7) at the frames, NaN in gaps.
 
-    A rigid body was not seen in a message whose quaternion is zero or NaN, nor any marker in one without its place.
+    A rigid body was not seen in a message whose quaternion is zero or NaN, nor any marker in one
+    without its place.
     """
     result = np.full((len(frames), 7), np.nan)
     turned = np.isfinite(poses[:, 3:]).all(1) & (np.linalg.norm(poses[:, 3:], axis=1) > 0.0)
@@ -361,12 +438,18 @@ def _at_frames(times: FloatArray, poses: FloatArray, frames: FloatArray, rate: f
     if not seen.any():
         return result
     times, poses = times[seen], poses[seen]
-    after = np.clip(np.searchsorted(times, frames), 1, len(times) - 1) if len(times) > 1 else np.zeros(len(frames), int)
+    after = (
+        np.clip(np.searchsorted(times, frames), 1, len(times) - 1)
+        if len(times) > 1
+        else np.zeros(len(frames), int)
+    )
     gap = times[after] - times[after - 1] if len(times) > 1 else np.full(len(frames), np.inf)
     known = (gap <= _GAP / rate) | np.isin(frames, times)
     for column in range(3):
         result[known, column] = np.interp(frames[known], times, poses[:, column])
     if turned.any() and len(times) > 1:
         turn = Slerp(times, Rotation.from_quat(poses[:, [4, 5, 6, 3]]))
-        result[known, 3:] = turn(np.clip(frames[known], times[0], times[-1])).as_quat()[:, [3, 0, 1, 2]]
+        result[known, 3:] = turn(np.clip(frames[known], times[0], times[-1])).as_quat()[
+            :, [3, 0, 1, 2]
+        ]
     return result

@@ -23,21 +23,26 @@ log = logging.getLogger(__name__)
 _OCCLUDED = {"", "nan", "null", "none", "na", "n/a", "#n/a", "-", "--"}
 _UNEVEN = 0.25  # of a frame: largest error of a time stamp
 _NEXT = 1.5  # of the median interval: the longest one without a missing frame
-_WHOLE = 5e-4  # difference of a rate from a whole number that counts as none; that of NTSC, 59.94 Hz, is 1e-3
+# Difference of a rate from a whole number that counts as none; that of NTSC, 59.94 Hz, is 1e-3.
+_WHOLE = 5e-4
 _LARGEST_STAMP = 1e12  # [s or 1] largest valid time or frame number
 _LEAST_FRAMES = 2  # of a recording
-_LONGEST_GAP = 3.0  # median intervals between lines, through which coordinates of uneven times are interpolated
+# Median intervals between lines, through which coordinates of uneven times are interpolated.
+_LONGEST_GAP = 3.0
 _LEAST_RECORDED = 0.1  # of the frames between the first and the last
 
 Place = tuple[str, str, int]  # label, axis and column of a coordinate
-# Names of the k columns with the rotation of a rigid body, and a function of their numbers (T, k) that returns
-# quaternions (T, 4), w first
+# Names of the k columns with the rotation of a rigid body, and a function of their numbers (T, k)
+# that returns quaternions (T, 4), w first
 Turn = tuple[Sequence[str], Callable[[FloatArray], FloatArray]]
 QUATERNION: Turn = (("qw", "qx", "qy", "qz"), np.asarray)
 
 
 def quaternions(numbers: FloatArray, rotations: Callable[[FloatArray], Rotation]) -> FloatArray:
-    """Returns quaternions (T, 4), w first, of numbers (T, k) by a function of (T', k); NaN where a number is."""
+    """Returns quaternions (T, 4), w first, of numbers (T, k) by a function of (T', k).
+
+    NaN where a number is.
+    """
     result = np.full((len(numbers), 4), np.nan)
     seen = np.isfinite(numbers).all(axis=1)
     if seen.any():
@@ -56,10 +61,11 @@ class Layout:
         unit: of positions; None if the table does not state it.
         clock: column of the frame number or time; None if every line is a frame.
         seconds: unit of the time [s]; None for frame numbers.
-        rate: of the frames [Hz], where there is no time; with times, that at which these are sampled again, as they are
-            uneven.
+        rate: of the frames [Hz], where there is no time; with times, that at which these are
+            sampled again, as they are uneven.
         channels: factors to SI units of the columns of the actuation.
-        loads: name, index in `force_sensors.AXES` and factor to SI units of the columns of force sensors.
+        loads: name, index in `force_sensors.AXES` and factor to SI units of the columns of force
+            sensors.
         planar: whether a coordinate that no marker has a column for is zero.
         turn: how rotations are given.
     """
@@ -83,7 +89,8 @@ class Layout:
         others += [] if self.clock is None else [self.clock]
         known = sorted({*chosen, *others, *self.channels, *self.loads} - {-1})
         read, lines = self._numbers(rows, known, path)
-        values = np.zeros((len(read), max(known, default=0) + 2))  # The last column stays zero, for planar markers.
+        # The last column stays zero, for planar markers.
+        values = np.zeros((len(read), max(known, default=0) + 2))
         values[:, known] = read
         stamps = np.arange(len(values), dtype=np.float64)
         if self.clock is not None:
@@ -92,8 +99,8 @@ class Layout:
             if turned:
                 body = markers[next(iter(turned))]
                 raise DataFileError(
-                    f"{path}: {body} is a rigid body, whose rotations are not sampled again at data.table.rate: export "
-                    "the recording at a constant frame rate."
+                    f"{path}: {body} is a rigid body, whose rotations are not sampled again at "
+                    "data.table.rate: export the recording at a constant frame rate."
                 )
             _check_rise(stamps, lines, path)
             values, stamps, lines = self._even(values, stamps, lines, self.rate, path)
@@ -106,13 +113,16 @@ class Layout:
             values, frames = values[: len(driven)], frames[: len(driven)]
             grid = np.arange(frames[-1] + 1)
             actuation = np.stack([np.interp(grid, frames, channel) for channel in driven.T], axis=1)
-        positions = np.full((frames[-1] + 1, len(markers), 3), np.nan)  # NaN in frames that were not recorded
+        # NaN in frames that were not recorded
+        positions = np.full((frames[-1] + 1, len(markers), 3), np.nan)
         positions[frames] = values[:, chosen].reshape(len(values), len(markers), 3)
         loads, given = dict[str, FloatArray](), set[tuple[str, int]]()
         for column, (name, axis, factor) in self.loads.items():
             if (name, axis) in given:
                 twice = f"{name}.{FORCES[axis]}"
-                raise DataFileError(f"{path} has two columns named '{twice}': rename one of these sensors.")
+                raise DataFileError(
+                    f"{path} has two columns named '{twice}': rename one of these sensors."
+                )
             given.add((name, axis))
             readings = loads.setdefault(name, np.full((len(positions), len(FORCES)), np.nan))
             readings[frames, axis] = factor * values[:, column]
@@ -121,7 +131,9 @@ class Layout:
             try:
                 turns[frames, marker] = self.turn[1](values[:, columns])
             except ValueError as error:
-                raise DataFileError(f"{path}: {markers[marker]} has a row that is no rotation ({error}).") from error
+                raise DataFileError(
+                    f"{path}: {markers[marker]} has a row that is no rotation ({error})."
+                ) from error
         timed = self.seconds is not None
         rate = measured_rate if timed else self.rate
         return Recording(
@@ -137,39 +149,50 @@ class Layout:
     ) -> tuple[FloatArray, FloatArray, list[int]]:
         """Returns values, times [s] and lines at a rate [Hz], from times that rise.
 
-        Channels hold their last known values; coordinates are interpolated linearly between lines that have them, and
-        are NaN where these are further apart than three in the median.
+        Channels hold their last known values; coordinates are interpolated linearly between lines
+        that have them, and are NaN where these are further apart than three in the median.
         """
         _check_span(stamps, float(np.median(np.diff(stamps))), lines, path)
         times = stamps[0] + np.arange(int((stamps[-1] - stamps[0]) * rate + 1e-6) + 1) / rate
         if len(times) < _LEAST_FRAMES:
-            raise DataFileError(f"{path} has less than two frames at {rate:g} Hz: raise data.table.rate.")
+            raise DataFileError(
+                f"{path} has less than two frames at {rate:g} Hz: raise data.table.rate."
+            )
         even = np.zeros((len(times), values.shape[1]))
         for column in range(values.shape[1] - 1):
             known = np.isfinite(values[:, column])
             at, series = stamps[known], values[known, column]
             after = np.searchsorted(at, times + 1e-9, side="right")
             if column in self.channels:
-                even[:, column] = np.where(after > 0, series[after - 1], np.nan) if len(at) else np.nan
+                even[:, column] = (
+                    np.where(after > 0, series[after - 1], np.nan) if len(at) else np.nan
+                )
             elif len(at) > 1:
                 even[:, column] = np.interp(times, at, series, left=np.nan, right=np.nan)
                 gaps = np.diff(at)[after.clip(1, len(at) - 1) - 1]
-                apart = np.abs(times[:, None] - at[np.stack([after - 1, after], 1).clip(0, len(at) - 1)]).min(1)
-                even[(gaps > _LONGEST_GAP * np.median(np.diff(at))) & (apart > 1e-6), column] = np.nan
+                apart = np.abs(
+                    times[:, None] - at[np.stack([after - 1, after], 1).clip(0, len(at) - 1)]
+                ).min(1)
+                even[(gaps > _LONGEST_GAP * np.median(np.diff(at))) & (apart > 1e-6), column] = (
+                    np.nan
+                )
             else:
                 even[:, column] = np.nan
         before = np.searchsorted(stamps, times + 1e-9, side="right") - 1
         return even, times, [lines[row] for row in before]
 
     def _markers(self, path: Path) -> tuple[list[str], list[int], dict[int, list[int]]]:
-        """Returns labels, the columns of their x, y and z, and those of rotations by the index of the rigid body.
+        """Returns labels, the columns of their x, y and z,
+        and those of rotations by the index of the rigid body.
 
         The column of the axis that planar markers do not have is -1.
         """
         columns: dict[tuple[str, str], int] = {}
         for label, axis, column in self.places:
             if (label, axis) in columns:
-                raise DataFileError(f"{path} has two columns named '{label}.{axis}': rename one of these markers.")
+                raise DataFileError(
+                    f"{path} has two columns named '{label}.{axis}': rename one of these markers."
+                )
             columns[label, axis] = column
         labels = list(dict.fromkeys(label for label, axis in columns if axis in AXES))
         axes = {axis for _, axis in columns if axis in AXES}
@@ -181,18 +204,28 @@ class Layout:
             if (label, axis) not in columns:
                 what, cure = "marker", "export it again with all"
                 if label in bodies:
-                    what, cure = "rigid body", f"export it again with all ({', '.join((*AXES, *self.turn[0]))})"
+                    what = "rigid body"
+                    cure = f"export it again with all ({', '.join((*AXES, *self.turn[0]))})"
                 elif len([name for name, _ in columns if name == label]) == 1:
                     cure = (
-                        "its single axis is a distance, as of a laser, and a marker needs two or three: give the "
-                        "others, 0 where it cannot move, or leave the column out in data.table"
+                        "its single axis is a distance, as of a laser, and a marker needs two or "
+                        "three: give the others, 0 where it cannot move, "
+                        "or leave the column out in data.table"
                     )
-                raise DataFileError(f"{path}: {what} {label} has no column '{label}.{axis}'; {cure}.")
+                raise DataFileError(
+                    f"{path}: {what} {label} has no column '{label}.{axis}'; {cure}."
+                )
         chosen = [columns.get((label, axis), -1) for label in labels for axis in AXES]
-        return labels, chosen, {labels.index(body): [columns[body, axis] for axis in self.turn[0]] for body in bodies}
+        return (
+            labels,
+            chosen,
+            {labels.index(body): [columns[body, axis] for axis in self.turn[0]] for body in bodies},
+        )
 
-    def _numbers(self, rows: Rows, columns: Sequence[int], path: Path) -> tuple[FloatArray, list[int]]:
-        """Returns columns (T, C) of the rows of numbers, NaN for empty cells, and the line numbers of the rows."""
+    def _numbers(
+        self, rows: Rows, columns: Sequence[int], path: Path
+    ) -> tuple[FloatArray, list[int]]:
+        """Columns (T, C) of rows of numbers, NaN for empty cells, and the line numbers of rows."""
         values, lines = [], []
         for line, row in enumerate(rows[self.first :], start=self.first + 1):
             if not any(row):
@@ -203,61 +236,86 @@ class Layout:
                 break
             if len(row) < self.width or any(row[self.width :]):
                 raise DataFileError(
-                    f"{path}, line {line}: {len(row)} cells where the other lines have {self.width}; the file is cut "
-                    "off or damaged there: export it again."
+                    f"{path}, line {line}: {len(row)} cells where the other lines have "
+                    f"{self.width}; the file is cut off or damaged there: export it again."
                 )
-            numbers = [np.nan if row[column].lower() in _OCCLUDED else number(row[column]) for column in columns]
+            numbers = [
+                np.nan if row[column].lower() in _OCCLUDED else number(row[column])
+                for column in columns
+            ]
             if None in numbers:
                 column = columns[numbers.index(None)]
                 raise DataFileError(
-                    f"{path}, line {line}, column {column + 1}: {row[column]!r} is not a number; write numbers with a "
-                    "decimal point, and leave the cells of an occluded marker empty."
+                    f"{path}, line {line}, column {column + 1}: {row[column]!r} is not a number; "
+                    "write numbers with a decimal point, "
+                    "and leave the cells of an occluded marker empty."
                 )
             values.append(numbers)
             lines.append(line)
         if len(values) < _LEAST_FRAMES:
-            raise DataFileError(f"{path} holds {len(values)} frames: a recording needs two or more.")
+            raise DataFileError(
+                f"{path} holds {len(values)} frames: a recording needs two or more."
+            )
         return np.array(values, dtype=np.float64), lines
 
 
 def _switched_on(driven: FloatArray, lines: Sequence[int], path: Path) -> FloatArray:
-    """Channels (T', C) from (T, C), cut off where one of them ends; missing first values equal the first known one.
+    """Channels (T', C) from (T, C), cut off where one of them ends.
+
+    Missing first values equal the first known one.
 
     A log may begin before the actuators are switched on, and end after they are switched off.
     """
     known = np.isfinite(driven)
     if np.isinf(driven).any() or not known.any(axis=0).all():
         row = int(np.argmax((np.isinf(driven) | ~known.any(axis=0)).any(axis=1)))
-        raise DataFileError(f"{path}, line {lines[row]}: an actuation is missing or infinite; every frame needs one.")
+        raise DataFileError(
+            f"{path}, line {lines[row]}: an actuation is missing or infinite; "
+            "every frame needs one."
+        )
     first = known.argmax(axis=0)
     end = len(driven) - int(known[::-1].argmax(axis=0).max())
     frames = np.arange(end)[:, None]
     filled = np.where(frames < first, driven[first, np.arange(driven.shape[1])], driven[:end])
     if (missing := np.isnan(filled).any(axis=1)).any():
         raise DataFileError(
-            f"{path}, line {lines[int(missing.argmax())]}: an actuation is missing; every frame between the first and "
-            "the last one that has it needs one."
+            f"{path}, line {lines[int(missing.argmax())]}: an actuation is missing; every frame "
+            "between the first and the last one that has it needs one."
         )
     if first.any() or end < len(driven):
         log.warning(
-            "%s has no actuation in its first %d frames, which get its first known value, nor in its last %d, which "
-            "are left out.",
+            "%s has no actuation in its first %d frames, which get its first known value, nor in "
+            "its last %d, which are left out.",
             *(path.name, int(first.max()), len(driven) - end),
         )
     if end < _LEAST_FRAMES:
-        raise DataFileError(f"{path} has an actuation in {end} frames: a recording needs two or more.")
+        raise DataFileError(
+            f"{path} has an actuation in {end} frames: a recording needs two or more."
+        )
     return np.asarray(filled)
 
 
 def is_data(row: Sequence[str]) -> bool:
-    """Whether a line holds positions: it begins with a digit, and most cells are numbers or empty."""
+    """Whether a line holds positions: it begins with a digit,
+    and most cells are numbers or empty.
+    """
     filled = [cell for cell in row if cell.lower() not in _OCCLUDED]
-    begins = bool(filled) and filled[0].lstrip("+-.")[:1].isdecimal() and (row[0] != "" or 2 * len(filled) > len(row))
-    return len(row) >= 3 and begins and 2 * sum(number(cell) is not None for cell in filled) > len(filled)
+    begins = (
+        bool(filled)
+        and filled[0].lstrip("+-.")[:1].isdecimal()
+        and (row[0] != "" or 2 * len(filled) > len(row))
+    )
+    return (
+        len(row) >= 3
+        and begins
+        and 2 * sum(number(cell) is not None for cell in filled) > len(filled)
+    )
 
 
 def has_numbers(row: Sequence[str]) -> bool:
-    """Whether half of the cells of a line or more, and two at least, are numbers, after words such as a state."""
+    """Whether half of the cells of a line or more, and two at least,
+    are numbers, after words such as a state.
+    """
     filled = [cell for cell in row if cell]
     return max(2, 0.5 * len(filled)) <= sum(number(cell) is not None for cell in filled)
 
@@ -269,17 +327,19 @@ def _check_rise(stamps: FloatArray, lines: Sequence[int], path: Path) -> None:
     if wrong.any():
         row = int(np.argmax(wrong))
         raise DataFileError(
-            f"{path}, line {lines[row]}: the time or frame does not rise (from {stamps[max(row - 1, 0)]:g} to "
-            f"{stamps[row]:g}), or is no number below 1e12; sort the lines and fill it in, or write what follows into "
-            "a file of its own if the clock begins anew there."
+            f"{path}, line {lines[row]}: the time or frame does not rise (from "
+            f"{stamps[max(row - 1, 0)]:g} to {stamps[row]:g}), or is no number below 1e12; sort "
+            "the lines and fill it in, or write what follows into a file of its own if the "
+            "clock begins anew there."
         )
 
 
 def _foreign(stamps: FloatArray, row: int, lines: Sequence[int], path: Path) -> DataFileError:
     """Returns the error of two lines that do not belong together."""
     return DataFileError(
-        f"{path}, line {lines[row]}: from the line before on, time or frame passes from {stamps[row - 1]:g} to "
-        f"{stamps[row]:g}, so that both do not belong to one recording; check that column."
+        f"{path}, line {lines[row]}: from the line before on, time or frame passes from "
+        f"{stamps[row - 1]:g} to {stamps[row]:g}, so that both do not belong to one recording; "
+        "check that column."
     )
 
 
@@ -289,8 +349,12 @@ def _check_span(stamps: FloatArray, interval: float, lines: Sequence[int], path:
         raise _foreign(stamps, int(np.argmax(np.diff(stamps))) + 1, lines, path)
 
 
-def _frames(stamps: FloatArray, timed: bool, lines: Sequence[int], path: Path) -> tuple[IntArray, float | None]:
-    """Returns the frame index of every row from its frame number or time [s], and the rate [Hz] from times."""
+def _frames(
+    stamps: FloatArray, timed: bool, lines: Sequence[int], path: Path
+) -> tuple[IntArray, float | None]:
+    """Returns the frame index of every row from its frame number or time [s],
+    and the rate [Hz] from times.
+    """
     _check_rise(stamps, lines, path)
     steps = np.diff(stamps)
     interval, span = float(np.median(steps)) if timed else 1.0, float(stamps[-1] - stamps[0])
@@ -305,8 +369,8 @@ def _frames(stamps: FloatArray, timed: bool, lines: Sequence[int], path: Path) -
     uneven = np.abs(exact - frames) > _UNEVEN
     if uneven.any():
         raise DataFileError(
-            f"{path}, line {lines[int(np.argmax(uneven))]}: the frames are not evenly spaced; export the recording "
-            "at a constant frame rate."
+            f"{path}, line {lines[int(np.argmax(uneven))]}: the frames are not evenly spaced; "
+            "export the recording at a constant frame rate."
         )
     if (np.diff(frames) < 1).any():
         raise _foreign(stamps, int(np.argmax(np.diff(frames) < 1)) + 1, lines, path)

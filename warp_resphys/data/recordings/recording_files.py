@@ -1,4 +1,7 @@
-"""Recordings in files: C3D, NumPy archives and HDF5; other modules read text and bags (docs/recordings.md)."""
+"""Recordings in files: C3D, NumPy archives and HDF5.
+
+Other modules read text and bags (docs/recordings.md).
+"""
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +38,8 @@ def read_recording(
     table: TableSettings | None = None,
     bag: BagSettings | None = None,
 ) -> Recording:
-    """Reads a recording in the format of its file name extension. docs/recordings.md describes the layouts.
+    """Reads a recording in the format of its file name extension. docs/recordings.md describes the
+    layouts.
 
     Args:
         path: A C3D, CSV, TSV, npz or HDF5 file, or a ROS bag: a file, or the folder of a ROS 2 bag.
@@ -52,16 +56,24 @@ def read_recording(
     path = Path(path)
     if not is_recording(path):
         raise DataFileError(
-            f"{path} is no recording that can be read: give a file that ends in {', '.join((*READERS, *SUFFIXES))}, as "
-            "docs/recordings.md has them."
+            f"{path} is no recording that can be read: give a file that ends in "
+            f"{', '.join((*READERS, *SUFFIXES))}, as docs/recordings.md has them."
         )
     reader = None if is_bag(path) else READERS[path.suffix.lower()]
     if table is not None and reader is not read_text_export:
-        raise DataFileError(f"{path} is no text, so that data.table cannot tell what its columns are: leave that out.")
+        raise DataFileError(
+            f"{path} is no text, so that data.table cannot tell what its columns are: leave that "
+            "out."
+        )
     if reader is not None:
-        return in_metres(reader(path) if table is None else read_text_export(path, table), units, rate, labels)
+        return in_metres(
+            reader(path) if table is None else read_text_export(path, table), units, rate, labels
+        )
     if bag is None:
-        raise InputError(f"{path} is a bag: name topics in data.bag (docs/recordings.md). It has {topics_of(path)}.")
+        raise InputError(
+            f"{path} is a bag: name topics in data.bag (docs/recordings.md). It has "
+            f"{topics_of(path)}."
+        )
     return in_metres(read_bag(path, bag), units, bag.rate or rate, labels)
 
 
@@ -70,7 +82,9 @@ def is_recording(path: Path) -> bool:
     return is_bag(path) or path.suffix.lower() in READERS
 
 
-def write_recording(path: str | Path, recording: Recording, attributes: Mapping[str, Any] | None = None) -> None:
+def write_recording(
+    path: str | Path, recording: Recording, attributes: Mapping[str, Any] | None = None
+) -> None:
     """Writes the HDF5 layout, in metres; `read_recording` returns the same recording.
 
     Attributes are further properties of the trial, such as a load. Missing folders are created.
@@ -79,7 +93,9 @@ def write_recording(path: str | Path, recording: Recording, attributes: Mapping[
         DataFileError: The file cannot be written.
     """
     known = {"labels": list(recording.labels), "rate_hz": recording.rate, "start": recording.start}
-    with atomic_hdf5(path, _KIND, {**(attributes or {}), **known, "source": recording.source.name}) as file:
+    with atomic_hdf5(
+        path, _KIND, {**(attributes or {}), **known, "source": recording.source.name}
+    ) as file:
         create(file, "positions", recording.positions, units="m")
         if recording.rest is not None:
             create(file, "rest", recording.rest, units="m")
@@ -90,18 +106,29 @@ def write_recording(path: str | Path, recording: Recording, attributes: Mapping[
             file.attrs["sensors"] = [*recording.loads]
         if recording.base is not None:
             quaternions = Rotation.from_rotvec(recording.base[:, 3:]).as_quat()[:, [3, 0, 1, 2]]
-            create(file, "base", np.concatenate([recording.base[:, :3], quaternions], axis=1), units="m, 1")
+            create(
+                file,
+                "base",
+                np.concatenate([recording.base[:, :3], quaternions], axis=1),
+                units="m, 1",
+            )
 
 
 def numbers(arrays: Arrays, name: str, path: Path) -> FloatArray:
-    """Returns an array of a file; raises DataFileError if it is missing or does not hold numbers."""
+    """Returns an array of a file.
+
+    Raises DataFileError if it is missing or does not hold numbers.
+    """
     if name not in arrays:
         raise DataFileError(
-            f"{path} has no array '{name}'; it has {', '.join(arrays) or 'none'}: check the path, or see "
-            "docs/recordings.md."
+            f"{path} has no array '{name}'; it has {', '.join(arrays) or 'none'}: check the "
+            "path, or see docs/recordings.md."
         )
     if arrays[name].dtype.kind not in "fiu":
-        raise DataFileError(f"{path}: '{name}' does not hold numbers (it is {arrays[name].dtype}); save numbers there.")
+        raise DataFileError(
+            f"{path}: '{name}' does not hold numbers (it is {arrays[name].dtype}); save numbers "
+            "there."
+        )
     return np.asarray(arrays[name], dtype=np.float64)
 
 
@@ -114,9 +141,12 @@ def _read_npz(path: Path) -> Recording:
 
 
 def _read_hdf5(path: Path) -> Recording:
-    """Reads an HDF5 file of any origin: every name of the layout may be a dataset or an attribute of the root."""
+    """Reads an HDF5 file of any origin: every name of the layout may be a dataset
+    or an attribute of the root.
+    """
     try:
-        path.open("rb").close()  # The library's error for a file that cannot be opened has no cause.
+        # The library's error for a file that cannot be opened has no cause.
+        path.open("rb").close()
         arrays = decode("h5py", path, "format", "kind", *_NAMES)
     except (OSError, DecodingError) as error:
         raise hdf5_error(path, error) from error
@@ -132,15 +162,20 @@ def _read_hdf5(path: Path) -> Recording:
 def _assembled(arrays: Arrays, path: Path) -> Recording:
     """Returns the recording of arrays of the layout, by name."""
     words = ("labels", "sensors", *_UNITS.values())
-    found = {name: numbers(arrays, name, path) for name in _NAMES if name in arrays and name not in words}
+    found = {
+        name: numbers(arrays, name, path) for name in _NAMES if name in arrays and name not in words
+    }
     for name in ("rate_hz", "start"):
         if name in found and found[name].size != 1:
-            raise DataFileError(f"{path}: '{name}' has the shape {found[name].shape}; it must be one number.")
+            raise DataFileError(
+                f"{path}: '{name}' has the shape {found[name].shape}; it must be one number."
+            )
     unit = _word(arrays, "actuation_units") or "1"
     if "actuation" in found:
         if unit not in SI_PER_ACTUATION_UNIT:
             raise DataFileError(
-                f"{path} gives its actuation in '{unit}': give it in one of {', '.join(SI_PER_ACTUATION_UNIT)}."
+                f"{path} gives its actuation in '{unit}': give it in one of "
+                f"{', '.join(SI_PER_ACTUATION_UNIT)}."
             )
         with np.errstate(over="ignore"):
             found["actuation"] = found["actuation"] * SI_PER_ACTUATION_UNIT[unit]
@@ -148,19 +183,22 @@ def _assembled(arrays: Arrays, path: Path) -> Recording:
     loads = found.get("loads", np.zeros((0, len(sensors), 6)))
     if loads.ndim != 3 or loads.shape[1] != len(sensors):
         raise DataFileError(
-            f"{path}: loads has the shape {loads.shape}, and sensors names {listed(sensors) or 'none'}: loads are "
-            "(frames, sensors, 6), forces and moments of each sensor [N, N m], NaN where they were not measured."
+            f"{path}: loads has the shape {loads.shape}, and sensors names "
+            f"{listed(sensors) or 'none'}: loads are (frames, sensors, 6), forces and moments of "
+            "each sensor [N, N m], NaN where they were not measured."
         )
     alone = "loads" in found and "positions" not in arrays
     positions = np.zeros((len(loads), 0, 3)) if alone else numbers(arrays, "positions", path)
     base = found.get("base")
     if base is not None and base.shape != (len(positions), 7):
         raise DataFileError(
-            f"{path}: base has the shape {base.shape}; it needs a place and a quaternion (w, x, y, z) for each of the "
-            f"{len(positions)} frames."
+            f"{path}: base has the shape {base.shape}; it needs a place and a quaternion (w, x, "
+            f"y, z) for each of the {len(positions)} frames."
         )
     return Recording(
-        labels=tuple(_text(label) for label in np.ravel(arrays["labels"])) if "labels" in arrays else (),
+        labels=tuple(_text(label) for label in np.ravel(arrays["labels"]))
+        if "labels" in arrays
+        else (),
         positions=positions,
         rate=found["rate_hz"].item() if "rate_hz" in found else np.nan,
         source=path,
@@ -187,27 +225,36 @@ def _read_c3d(path: Path) -> Recording:
     try:
         content = path.read_bytes()
         if len(content) < 2 or content[1] != _C3D_MAGIC:
-            raise DataFileError(f"{path} is not a C3D file: give a motion-capture recording in C3D format.")
+            raise DataFileError(
+                f"{path} is not a C3D file: give a motion-capture recording in C3D format."
+            )
         processor_at = (content[0] - 1) * 512 + 3
         if len(content) < 512 or content[0] == 0 or len(content) <= processor_at:
-            raise DataFileError(f"{path} is truncated: it ends after {len(content)} bytes; copy or export it again.")
+            raise DataFileError(
+                f"{path} is truncated: it ends after {len(content)} bytes; copy or export it again."
+            )
         if content[processor_at] == _SGI_PROCESSOR:
             raise DataFileError(
-                f"{path} has the byte order of SGI (MIPS) computers, which is not read: export it in that of Intel."
+                f"{path} has the byte order of SGI (MIPS) computers, which is not read: export "
+                "it in that of Intel."
             )
         arrays = decode("ezc3d", path)
     except OSError as error:
-        raise DataFileError(f"Cannot read {path}: {error.strerror}; check the path of the recording.") from error
+        raise DataFileError(
+            f"Cannot read {path}: {error.strerror}; check the path of the recording."
+        ) from error
     except DecodingError as error:
-        raise DataFileError(f"{path} cannot be decoded ({error}): copy or export it again.") from error
+        raise DataFileError(
+            f"{path} cannot be decoded ({error}): copy or export it again."
+        ) from error
     points = arrays["points"]
     if points.ndim != 3 or points.shape[1] == 0 or points.shape[2] == 0:
         raise DataFileError(f"{path} holds no marker trajectories: give a C3D file with 3D points.")
     first, last = struct.unpack_from("<2H", content, 6)
     if points.shape[2] < last - first + 1:  # The decoder silently corrects the header.
         raise DataFileError(
-            f"{path} is truncated: it holds {points.shape[2]} of the {last - first + 1} frames that its header "
-            "declares; copy or export it again."
+            f"{path} is truncated: it holds {points.shape[2]} of the {last - first + 1} frames "
+            "that its header declares; copy or export it again."
         )
     raw_labels = arrays["labels"][: points.shape[1]].tolist()
     labels = [decoded(label.encode(errors="surrogateescape")) or "" for label in raw_labels]

@@ -1,4 +1,6 @@
-"""The barrier and the smoothed friction of contact on tensors, and contact forces (equations in `obstacle_contact`)."""
+"""The barrier and the smoothed friction of contact on tensors,
+and contact forces (equations in `obstacle_contact`).
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +14,9 @@ from ...stepping.state import Reaction
 
 
 def barrier_pressure(d: torch.Tensor, reach: float) -> torch.Tensor:
-    """Returns the pressure of the barrier over its stiffness, -B'(d / D), at distances d > 0, with the reach D [m]."""
+    """Returns the pressure of the barrier over its stiffness, -B'(d / D),
+    at distances d > 0, with the reach D [m].
+    """
     pressure: torch.Tensor = _Pressure.apply(d, reach)
     return pressure
 
@@ -50,7 +54,8 @@ def friction_over_slide(u: torch.Tensor, slip: torch.Tensor) -> tuple[torch.Tens
 
 @dataclass(frozen=True)
 class ContactForces:
-    """Contact at the end of a step, for every vertex of the surface and every obstacle, differentiable.
+    """Contact at the end of a step, for every vertex of the surface
+    and every obstacle, differentiable.
 
     That between surfaces has no axis of obstacles, and is with the nearest others.
 
@@ -60,10 +65,11 @@ class ContactForces:
         gap: (B, P, O) distances [m].
         normal: (B, P, O, 3) forces of the barrier on the vertices [N].
         friction: (B, P, O, 3) forces of friction on them [N].
-        slide: (B, P, O) size of the velocity of sliding at the end of the step, times the effective step h_e [m]: for
-            implicit Euler the slide in the step, for BDF2 not, whose h_e is two thirds of a step.
-        sticks: (B, P, O) whether a vertex that is pressed against an obstacle slides less than friction needs to be
-            fully developed.
+        slide: (B, P, O) size of the velocity of sliding at the end of the step, times the effective
+            step h_e [m]: for implicit Euler the slide in the step, for BDF2 not, whose h_e is two
+            thirds of a step.
+        sticks: (B, P, O) whether a vertex that is pressed against an obstacle slides less than
+            friction needs to be fully developed.
         places: (B, P, 3) positions of the vertices [m].
     """
 
@@ -86,7 +92,9 @@ class ContactForces:
         if obstacle is not None:
             if obstacle not in self.obstacles:
                 known = (
-                    f"choose one of {', '.join(self.obstacles)}" if self.obstacles else "bodies touch one another here"
+                    f"choose one of {', '.join(self.obstacles)}"
+                    if self.obstacles
+                    else "bodies touch one another here"
                 )
                 raise InputError(f"there is no obstacle {obstacle!r}: {known}.")
             forces = forces[:, :, self.obstacles.index(obstacle)]

@@ -1,4 +1,6 @@
-"""Checks that a body and obstacles do not pass through one another, and pushes out of obstacles that have moved."""
+"""Checks that a body and obstacles do not pass through one another,
+and pushes out of obstacles that have moved.
+"""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -41,15 +43,19 @@ class Clearance:
         self._obstacles, self._distance, self._shapes = obstacles, distance, shapes
         self._vertices, self._free, self._rigid = vertices, free, rigid
 
-    def check_way(self, carried: torch.Tensor, ends: torch.Tensor, pose: Pose, gaps: torch.Tensor) -> None:
-        """Raises InputError where an obstacle passes over a vertex, or a fixed vertex through an obstacle.
+    def check_way(
+        self, carried: torch.Tensor, ends: torch.Tensor, pose: Pose, gaps: torch.Tensor
+    ) -> None:
+        """Raises InputError where an obstacle passes over a vertex,
+        or a fixed vertex through an obstacle.
 
-        A way is followed to its first place on an obstacle: by the tangential planes of a convex one, which are
-        never beyond it, and by the largest slope of the distance from another.
+        A way is followed to its first place on an obstacle: by the tangential planes of a convex
+        one, which are never beyond it, and by the largest slope of the distance from another.
 
         Args:
             carried: (B, P, O, 3) vertices as if they had moved with the obstacles [m].
-            ends: (B, P, 3) where they are before the solve, fixed vertices at the end of the step [m].
+            ends: (B, P, 3) where they are before the solve, fixed vertices at the end of the step
+                [m].
             pose: poses after the motion.
             gaps: (B, P, O) distances before it [m].
         """
@@ -57,26 +63,35 @@ class Clearance:
         for k in (ways.norm(dim=-1) > gaps).any(1).any(0).nonzero().ravel().tolist():
             obstacle, way = tuple(self._obstacles.values())[k], ways[:, :, k]
             end, side = (value[:, :, k] for value in self._shapes.distances(ends, pose))
-            share, most = torch.zeros_like(end), torch.full_like(end, obstacle.size[1]) * way.norm(dim=-1)
+            share = torch.zeros_like(end)
+            most = torch.full_like(end, obstacle.size[1]) * way.norm(dim=-1)
             for _ in range(_ADVANCES):
                 d, n = (
-                    value[:, :, k] for value in self._shapes.distances(carried[:, :, k] + share[..., None] * way, pose)
+                    value[:, :, k]
+                    for value in self._shapes.distances(
+                        carried[:, :, k] + share[..., None] * way, pose
+                    )
                 )
                 slope = most if isinstance(obstacle, DistanceGrid) else -(n * way).sum(-1)
-                further = torch.where(slope > 0.0, d / slope.clamp_min(torch.finfo(d.dtype).tiny), 2.0)
+                further = torch.where(
+                    slope > 0.0, d / slope.clamp_min(torch.finfo(d.dtype).tiny), 2.0
+                )
                 share = (share + further.clamp_min(0.0)).clamp_max(2.0)
                 if bool(((share >= 1.0) | (further < 1e-6)).all()):
                     break
             passes = (share < 1.0) & ((end > 0.0) | ((n * side).sum(-1) < 0.0))
             if bool(passes.any()):
-                vertex, name = int(self._vertices[passes.any(0).nonzero()[0]]), list(self._obstacles)[k]
+                vertex = int(self._vertices[passes.any(0).nonzero()[0]])
+                name = list(self._obstacles)[k]
                 raise InputError(
-                    f"vertex {vertex} of the body and the obstacle {name!r} pass through one another "
-                    "in a step: move the obstacle, or the fixed vertices, less in a step."
+                    f"vertex {vertex} of the body and the obstacle {name!r} pass through one "
+                    "another in a step: move the obstacle, "
+                    "or the fixed vertices, less in a step."
                 )
 
     def pushed_out(self, q: torch.Tensor, pose: Pose, gaps: torch.Tensor) -> torch.Tensor:
-        """Returns positions (B, N, 3) as far from obstacles that have moved as before, at most half of D.
+        """Returns positions (B, N, 3) as far from obstacles
+        that have moved as before, at most half of D.
 
         Args:
             q: (B, N, 3) positions before the motion [m].
@@ -86,7 +101,8 @@ class Clearance:
         need, free = gaps.clamp_max(0.5 * self._distance), self._free
         for _ in range(_PUSHES):
             d, n = self._shapes.distances(q[:, self._vertices], pose)
-            # Not to the last digit, which float32 does not have; nor where another environment needs another push.
+            # Not to the last digit, which float32 does not have; nor where another environment
+            # needs another push.
             lack, worst = (torch.where(d < 0.999 * need, need - d, 0.0) * free[:, None]).max(-1)
             if not bool(lack.any()):
                 break
@@ -104,21 +120,23 @@ class Clearance:
         return q
 
     def check_start(self, rest: torch.Tensor, pose: Pose) -> None:
-        """Raises InputError for a distance that fits no contact, and warns of a start that throws the body away."""
+        """Raises InputError for a distance that fits no contact,
+        and warns of a start that throws the body away.
+        """
         surface, names, reach = rest[self._vertices], list(self._obstacles), self._distance
         thickness = float((surface.amax(0) - surface.amin(0)).min())
         if reach > thickness:
             raise InputError(
-                f"contact.distance is {1e3 * reach:g} mm and the body {1e3 * thickness:g} mm thick: take a "
-                "hundredth to a tenth of that."
+                f"contact.distance is {1e3 * reach:g} mm and the body {1e3 * thickness:g} mm "
+                "thick: take a hundredth to a tenth of that."
             )
         d, _ = self._shapes.distances(surface[None], pose)
         self.check(rest[None], pose, "at rest", d)
         least = d.amin((0, 1))
         if bool((least < _DEEP * reach).any()):
             log.warning(
-                "The body starts %.2g mm from %s, deep in its barrier, which throws it away: start it at "
-                "contact.distance (%g mm) or further, or hold it there.",
+                "The body starts %.2g mm from %s, deep in its barrier, which throws it away: "
+                "start it at contact.distance (%g mm) or further, or hold it there.",
                 *(1e3 * float(least.min()), names[int(least.argmin())], 1e3 * reach),
             )
 
@@ -131,6 +149,7 @@ class Clearance:
             worst = int(deepest.argmin())
             vertex = int(self._vertices[d.detach()[..., worst].amin(0).argmin()])
             raise InputError(
-                f"the body is within the obstacle {list(self._obstacles)[worst]!r} {when}: vertex {vertex} by "
-                f"{-1e3 * float(deepest[worst]):.3g} mm; move one of them, or move obstacles less in a step."
+                f"the body is within the obstacle {list(self._obstacles)[worst]!r} {when}: "
+                f"vertex {vertex} by {-1e3 * float(deepest[worst]):.3g} mm; move one of them, or "
+                "move obstacles less in a step."
             )

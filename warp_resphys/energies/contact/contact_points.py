@@ -1,4 +1,6 @@
-"""Contact with obstacles: its quantities, and vertices of a surface with areas and factors of friction."""
+"""Contact with obstacles: its quantities, and vertices of a surface
+with areas and factors of friction.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +19,9 @@ STIFFNESS = Quantity("contact_stiffness", "Pa", 0.0, per="obstacle")
 FRICTION = Quantity("contact_friction", "", 0.0, closed=True, per="obstacle")
 GROWTH = Quantity("obstacle_growth", "m", per="obstacle", typical=1e-3)
 SHIFT = tuple(Quantity(f"obstacle_{axis}", "m", per="obstacle", typical=1e-2) for axis in "xyz")
-TURN = tuple(Quantity(f"obstacle_turn_{axis}", "rad", per="obstacle", typical=0.1) for axis in "xyz")
+TURN = tuple(
+    Quantity(f"obstacle_turn_{axis}", "rad", per="obstacle", typical=0.1) for axis in "xyz"
+)
 MOTION = (
     *(Quantity(f"obstacle_move_{axis}", "m", per="obstacle", typical=1e-2) for axis in "xyz"),
     *(Quantity(f"obstacle_rotate_{axis}", "rad", per="obstacle", typical=0.1) for axis in "xyz"),
@@ -35,7 +39,10 @@ class ContactPoints(Points):
 
 
 def vertex_areas(mesh: Mesh) -> NDArray[np.float64]:
-    """Returns the part of the surface that belongs to every vertex, (N,) [m^2]; its sum is that of the surface."""
+    """Returns the part of the surface that belongs to every vertex, (N,) [m^2].
+
+    Its sum is that of the surface.
+    """
     faces, areas = boundary_faces(mesh), np.zeros(len(mesh.vertices))
     if faces.shape[1] != FACES[faces.shape[1]].corners:
         faces = face_triangles(faces)  # Integrals of quadratic shape functions vanish at corners.
@@ -49,7 +56,8 @@ def vertex_areas(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def vertex_factors(mesh: Mesh, factors: Mapping[str, float]) -> NDArray[np.float64]:
-    """Returns the factor of friction at every vertex, (N,): the mean of its cells', which is one outside all regions.
+    """Returns the factor of friction at every vertex, (N,):
+    the mean of its cells', which is one outside all regions.
 
     Raises:
         InputError: the mesh has no such region, or a cell is in two of them.
@@ -59,7 +67,10 @@ def vertex_factors(mesh: Mesh, factors: Mapping[str, float]) -> NDArray[np.float
         with naming("contact.friction_factors: "):
             cells = mesh.region(name)
         if named[cells].any():
-            raise InputError(f"contact.friction_factors: {name!r} shares cells with another region: leave one out.")
+            raise InputError(
+                f"contact.friction_factors: {name!r} shares cells "
+                "with another region: leave one out."
+            )
         by_cell[cells], named[cells] = factor, True
     corners, size = mesh.cells.ravel(), len(mesh.vertices)
     counts = np.bincount(corners, minlength=size).clip(1)

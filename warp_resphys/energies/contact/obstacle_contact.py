@@ -1,25 +1,28 @@
 r"""Contact of a body with rigid obstacles: a barrier against penetration, and Coulomb friction.
 
-A point of the surface, which stands for the area a, has with the distance d from an obstacle the energy
+A point of the surface, which stands for the area a, has with the distance d from an obstacle the
+energy
 
     a kappa D B(d / D),     B(s) = -(s - 1)^2 ln s for s < 1, and 0 beyond,
 
-so that the pressure -kappa B'(d / D) begins at the distance D, has a continuous derivative, and grows without bound
-towards d = 0 (incremental potential contact; Li et al. 2020). The stiffness kappa [Pa] is constant: the gap of a
-resting body follows from it and is part of the geometry, about D (1 - sqrt(p / 3 kappa)) under a small pressure p
-within a face. At edges, a point also stands for its part of the side walls.
+so that the pressure -kappa B'(d / D) begins at the distance D, has a continuous derivative, and
+grows without bound towards d = 0 (incremental potential contact; Li et al. 2020). The stiffness
+kappa [Pa] is constant: the gap of a resting body follows from it and is part of the geometry, about
+D (1 - sqrt(p / 3 kappa)) under a small pressure p within a face. At edges, a point also stands for
+its part of the side walls.
 
-Friction of the coefficient mu, with the normal force lambda and the normal n of the start of a step, and the slide
-u = (1 - n n^T)(x - r) relative to the obstacle since then, has the energy
+Friction of the coefficient mu, with the normal force lambda and the normal n of the start of a
+step, and the slide u = (1 - n n^T)(x - r) relative to the obstacle since then, has the energy
 
     mu lambda f(|u|),     f'(y) = 2 y / e - y^2 / e^2 for y < e, and 1 beyond,     e = h v_s,
 
-with the slip speed v_s at which it is fully developed. A body that should stick creeps: at the share c of what friction
-can hold, with the speed v_s (1 - sqrt(1 - c)). As lambda and n depend on the state at the start of the step, gradients
-by it include them.
+with the slip speed v_s at which it is fully developed. A body that should stick creeps: at the
+share c of what friction can hold, with the speed v_s (1 - sqrt(1 - c)). As lambda and n depend on
+the state at the start of the step, gradients by it include them.
 
-In a static equilibrium after a state, friction acts against the slide since that state, with the normal forces of that
-state: there is none where the body was not pressed against the obstacle before.
+In a static equilibrium after a state, friction acts against the slide since that state, with the
+normal forces of that state: there is none where the body was not pressed against the obstacle
+before.
 
 M. Li et al.: Incremental potential contact. ACM Transactions on Graphics 39 (4), 2020.
 """
@@ -66,11 +69,12 @@ from .obstacles import DistanceGrid
 class Contact(Energy):
     """Contact of a body with obstacles (equations in the module's docstring).
 
-    Parameters, one for each obstacle: ``contact_stiffness`` [Pa], ``contact_friction``, ``obstacle_growth``, by which
-    its surface lies further out [m], ``obstacle_x``, ``_y`` and ``_z``, by which it lies elsewhere [m], and
-    ``obstacle_turn_x``, ``_y`` and ``_z``, a rotation vector about its position [rad]. Inputs, if an obstacle moves,
-    are `MOTION`, its pose at the end of a step relative to the configured one, which add to the last six. The points
-    are the vertices of the surface, at which friction is multiplied by the factor of their region.
+    Parameters, one for each obstacle: ``contact_stiffness`` [Pa], ``contact_friction``,
+    ``obstacle_growth``, by which its surface lies further out [m], ``obstacle_x``, ``_y`` and
+    ``_z``, by which it lies elsewhere [m], and ``obstacle_turn_x``, ``_y`` and ``_z``, a rotation
+    vector about its position [rad]. Inputs, if an obstacle moves, are `MOTION`, its pose at the end
+    of a step relative to the configured one, which add to the last six. The points are the vertices
+    of the surface, at which friction is multiplied by the factor of their region.
 
     Raises:
         InputError: no obstacle, a value out of range, or values that do not fit the obstacles.
@@ -79,11 +83,13 @@ class Contact(Energy):
     is_barrier: ClassVar[bool] = True
 
     obstacles: Mapping[str, Obstacle]
-    stiffness: Parameter | Mapping[str, float] = 1e5  # kappa [Pa], a number or one by obstacle, in order or by name
+    stiffness: Parameter | Mapping[str, float] = (
+        1e5  # kappa [Pa], a number or one by obstacle, in order or by name
+    )
     friction: Parameter | Mapping[str, float] = 0.0  # mu, likewise
     distance: float = 1e-3  # D [m]
     slip_speed: float = 1e-3  # v_s [m/s]
-    friction_factors: Mapping[str, float] = field(default_factory=dict)  # of the friction of regions of the mesh
+    friction_factors: Mapping[str, float] = field(default_factory=dict)  # of regions of the mesh
 
     def __post_init__(self) -> None:
         """Checks the values."""
@@ -92,15 +98,24 @@ class Contact(Energy):
             raise InputError("contact needs an obstacle or more: give them by name.")
         for name, obstacle in self.obstacles.items():
             if not isinstance(obstacle, Obstacle):
-                raise InputError(f"the obstacle {name} is {in_short(obstacle)}: give one, such as HalfSpace(axis=...).")
-        grids = {name: DistanceGrid.of_file(o) for name, o in self.obstacles.items() if isinstance(o, SurfaceFile)}
+                raise InputError(
+                    f"the obstacle {name} is {in_short(obstacle)}: give one, such as "
+                    "HalfSpace(axis=...)."
+                )
+        grids = {
+            name: DistanceGrid.of_file(o)
+            for name, o in self.obstacles.items()
+            if isinstance(o, SurfaceFile)
+        }
         object.__setattr__(self, "obstacles", {**self.obstacles, **grids})
         for name in ("distance", "slip_speed"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise InputError(f"contact.{name} is {getattr(self, name):g}: it must be positive.")
         for region, factor in self.friction_factors.items():
             if not (math.isfinite(factor) and factor >= 0.0):
-                raise InputError(f"contact.friction_factors.{region} is {factor:g}: it must be zero or more.")
+                raise InputError(
+                    f"contact.friction_factors.{region} is {factor:g}: it must be zero or more."
+                )
         for name, quantity in (("stiffness", STIFFNESS), ("friction", FRICTION)):
             values = self._by_obstacle(name)
             quantity.check(values)
@@ -113,8 +128,8 @@ class Contact(Energy):
             return values
         if values.keys() != self.obstacles.keys():
             raise InputError(
-                f"contact.{name} has values for {listed([*values])}, but the obstacles are {listed(self.names)}: give "
-                "a value to every one."
+                f"contact.{name} has values for {listed([*values])}, but the obstacles are "
+                f"{listed(self.names)}: give a value to every one."
             )
         return [values[obstacle] for obstacle in self.obstacles]
 
@@ -147,7 +162,10 @@ class Contact(Energy):
     @override
     def defaults(self) -> Mapping[str, Parameter]:
         zeros = {quantity.name: 0.0 for quantity in (GROWTH, *SHIFT, *TURN)}
-        known = {STIFFNESS.name: self._by_obstacle("stiffness"), FRICTION.name: self._by_obstacle("friction")}
+        known = {
+            STIFFNESS.name: self._by_obstacle("stiffness"),
+            FRICTION.name: self._by_obstacle("friction"),
+        }
         return {**known, **zeros}
 
     @override
@@ -155,7 +173,11 @@ class Contact(Energy):
         areas = vertex_areas(mesh)
         vertices = np.flatnonzero(areas)
         factors = vertex_factors(mesh, self.friction_factors)[vertices]
-        return (ContactPoints(vertices[:, None], np.ones((len(vertices), 1, 1, 1)), areas[vertices], factors),)
+        return (
+            ContactPoints(
+                vertices[:, None], np.ones((len(vertices), 1, 1, 1)), areas[vertices], factors
+            ),
+        )
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "ContactTerm":
@@ -169,7 +191,8 @@ class Contact(Energy):
 class BoundContact(BoundEnergy):
     """Contact in a simulator.
 
-    Memory is the pose of the obstacles and that one step before, if one moves. Without memory, they have not moved.
+    Memory is the pose of the obstacles and that one step before, if one moves. Without memory, they
+    have not moved.
     """
 
     rate_independent = True
@@ -182,7 +205,9 @@ class BoundContact(BoundEnergy):
         assert isinstance(points, ContactPoints)
         if len(site.body.symmetry) or len(site.body.glued):
             what = "symmetry planes" if len(site.body.symmetry) else "glued vertices"
-            raise InputError(f"a body with {what} has no contact with obstacles: leave one of them out.")
+            raise InputError(
+                f"a body with {what} has no contact with obstacles: leave one of them out."
+            )
         self._vertices = torch.as_tensor(points.nodes[:, 0], device=like.device)
         self._area = site.tensor(points.areas)
         self._factor = site.tensor(points.factors)  # (P,) of friction
@@ -194,17 +219,26 @@ class BoundContact(BoundEnergy):
         self._moving = site.tensor(np.array([float(o.moves) for o in obstacles]))
         if contact.moves:
             sizes = (("contact_place", "m", (3,)), ("contact_turn", "rotation", (3, 3)))
-            names = [(f"{when}{name}", unit, size) for when in ("", "previous_") for name, unit, size in sizes]
-            self.memory = tuple(Memory(name, unit, (contact.count, *size), "obstacle") for name, unit, size in names)
+            names = [
+                (f"{when}{name}", unit, size)
+                for when in ("", "previous_")
+                for name, unit, size in sizes
+            ]
+            self.memory = tuple(
+                Memory(name, unit, (contact.count, *size), "obstacle") for name, unit, size in names
+            )
         self._fixed = torch.as_tensor(site.body.fixed_vertices + site.first, device=like.device)
         free = (~torch.isin(self._vertices, self._fixed)).to(self._area)
         rigid = list[tuple[torch.Tensor, torch.Tensor]]()
         for name in site.body.controls:
             cells = site.body.mesh.cells[site.body.mesh.region(name)]
             part = torch.as_tensor(np.unique(cells) + site.first, device=like.device)
-            if len(surface := torch.isin(self._vertices, part).nonzero().ravel()):  # others are out of reach
+            if len(surface := torch.isin(self._vertices, part).nonzero().ravel()):
+                # Others are out of reach.
                 rigid.append((surface, part[~torch.isin(part, self._vertices)]))
-        self._clearance = Clearance(contact.obstacles, contact.distance, self._shapes, self._vertices, free, rigid)
+        self._clearance = Clearance(
+            contact.obstacles, contact.distance, self._shapes, self._vertices, free, rigid
+        )
         self._clearance.check_start(like, self.pose(contact.defaults, {}))
 
     def pose(self, parameters: Mapping[str, Any], inputs: Mapping[str, torch.Tensor]) -> Pose:
@@ -227,21 +261,26 @@ class BoundContact(BoundEnergy):
             most = float(pose.growth.detach()[:, k].max()) + self._contact.distance
             if obstacle.margin < most:
                 raise InputError(
-                    f"the grid of {name!r} ends {1e3 * obstacle.margin:.3g} mm outside of it, and contact begins at "
-                    f"{1e3 * most:.3g} mm, with obstacle_growth: give it a larger margin."
+                    f"the grid of {name!r} ends {1e3 * obstacle.margin:.3g} mm outside of it, "
+                    f"and contact begins at {1e3 * most:.3g} mm, "
+                    "with obstacle_growth: give it a larger margin."
                 )
         return {**values, "contact_place": pose.place, "contact_turn": pose.turn}
 
     def _pose(self, values: Values, inputs: Mapping[str, torch.Tensor], batch: int) -> Pose:
-        """Returns the poses (B, O, ...) at the end of a step with the values of `prepare` and inputs by name."""
+        """Poses (B, O, ...) at the end of a step with values of `prepare` and inputs by name."""
         if self._contact.moves:
-            moved = self.pose({q.name: value_of(values, q.name) for q in (GROWTH, *SHIFT, *TURN)}, inputs)
+            moved = self.pose(
+                {q.name: value_of(values, q.name) for q in (GROWTH, *SHIFT, *TURN)}, inputs
+            )
             parts = [moved.place, moved.turn, moved.growth]
         else:
             parts = [value_of(values, name) for name in (*POSE, GROWTH.name)]
         return Pose(*(part.expand(batch, *part.shape[1:]) for part in parts))
 
-    def poses(self, memories: Sequence[Mapping[str, torch.Tensor]], values: Values, batch: int) -> list[Pose]:
+    def poses(
+        self, memories: Sequence[Mapping[str, torch.Tensor]], values: Values, batch: int
+    ) -> list[Pose]:
         """Returns the poses of the obstacles in successive states.
 
         Args:
@@ -251,7 +290,11 @@ class BoundContact(BoundEnergy):
         """
         still, poses = self._pose(values, {}, batch), list[Pose]()
         for memory in memories:
-            poses.append(Pose(memory.get(POSE[0], still.place), memory.get(POSE[1], still.turn), still.growth))
+            poses.append(
+                Pose(
+                    memory.get(POSE[0], still.place), memory.get(POSE[1], still.turn), still.growth
+                )
+            )
         return poses
 
     @override
@@ -270,14 +313,17 @@ class BoundContact(BoundEnergy):
         if self._contact.moves:
             # Where an obstacle was at a point, it moves with the obstacle; so do the normals.
             inside = before.local(here)
-            ways, weights = (here, earlier.world(inside)), [weight for _, weight in stage.strain_weights] or [1.0]
+            ways = (here, earlier.world(inside))
+            weights = [weight for _, weight in stage.strain_weights] or [1.0]
             was = sum(weight * way for weight, way in zip(weights, ways, strict=False))
             reference = reference + now.world(inside) - was
             n = torch.einsum("boij,bokj,bpok->bpoi", now.turn, before.turn, n)
             self._check_motion(step.inputs, before, now)
             here = now.world(inside)
         if self._contact.moves or step.fixed_positions is not None:
-            self._clearance.check_way(here.detach(), self._ends(x, step.fixed_positions), now, d.detach())
+            self._clearance.check_way(
+                here.detach(), self._ends(x, step.fixed_positions), now, d.detach()
+            )
         if self._contact.moves:
             start = self._clearance.pushed_out(state.q.detach(), now, d.detach())
         load = self._load(d, step.values)
@@ -306,7 +352,8 @@ class BoundContact(BoundEnergy):
         values = self.begin_step(step)
         at, pose = x[:, self._vertices], self._pose(step.values, step.inputs, step.state.batch)
         d, n = self._shapes.distances(at, pose)
-        normal, way = value_of(values, "contact_normal"), at[:, :, None] - value_of(values, "contact_reference")
+        normal = value_of(values, "contact_normal")
+        way = at[:, :, None] - value_of(values, "contact_reference")
         u = way - (way * normal).sum(-1, keepdim=True) * normal
         slip = value_of(values, "contact_slip")[..., None]
         y, factor = friction_over_slide(u, slip)
@@ -329,13 +376,21 @@ class BoundContact(BoundEnergy):
         memory = step.state.memory
         poses = [memory.get(name) for name in (m.name for m in self.memory)]
         if poses[0] is None or poses[1] is None:
-            rest = now if math.isfinite(step.stage.step) else self._pose(step.values, {}, step.state.batch)
+            rest = (
+                now
+                if math.isfinite(step.stage.step)
+                else self._pose(step.values, {}, step.state.batch)
+            )
             return rest, rest
         before = Pose(poses[0], poses[1], now.growth)
-        return before, before if poses[2] is None or poses[3] is None else Pose(poses[2], poses[3], now.growth)
+        return before, before if poses[2] is None or poses[3] is None else Pose(
+            poses[2], poses[3], now.growth
+        )
 
     @override
-    def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
+    def end_step(
+        self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
         if not self._contact.moves:
             return {}
         now = self._pose(step.values, step.inputs, step.state.batch)
@@ -344,26 +399,37 @@ class BoundContact(BoundEnergy):
         return dict(zip((m.name for m in self.memory), poses, strict=True))
 
     def _ends(self, x: torch.Tensor, fixed_positions: torch.Tensor | None) -> torch.Tensor:
-        """Returns the vertices of the surface (B, P, 3), the fixed ones where they are at the end of a step [m]."""
+        """Returns the vertices of the surface (B, P, 3),
+        the fixed ones where they are at the end of a step [m].
+        """
         x = x.detach()
         if fixed_positions is None:
             return x
-        whole = x.new_zeros(len(x), len(self.site.rest_positions), 3).index_copy(1, self._vertices, x)
+        whole = x.new_zeros(len(x), len(self.site.rest_positions), 3).index_copy(
+            1, self._vertices, x
+        )
         whole[:, self._fixed] = fixed_positions.detach()
         return whole[:, self._vertices]
 
     def _check_motion(self, inputs: Mapping[str, torch.Tensor], before: Pose, now: Pose) -> None:
-        """Raises InputError where an obstacle that does not move has an input, or one turns too far in a step."""
+        """Raises InputError where an obstacle that does not move has an input,
+        or one turns too far in a step.
+        """
         still = self._moving == 0.0
         for quantity in MOTION:
             value = inputs.get(quantity.name)
             if value is not None and bool((value[..., still] != 0.0).any()):
-                raise InputError(f"{quantity.name} is not zero for an obstacle without moves=True: set it there.")
+                raise InputError(
+                    f"{quantity.name} is not zero for an obstacle without moves=True: set it there."
+                )
         if bool((torch.einsum("boij,boij->bo", before.turn, now.turn) < 1.0).any()):
-            raise InputError("an obstacle turns by more than 90 degrees in a step: turn it less in a step.")
+            raise InputError(
+                "an obstacle turns by more than 90 degrees in a step: turn it less in a step."
+            )
 
     def outside(self, q: torch.Tensor, state: State, values: Values) -> torch.Tensor:
-        """Returns positions (B, N, 3) [m] out of the obstacles, at least by the gaps of a state, at most by half of D.
+        """Returns positions (B, N, 3) [m] out of the obstacles,
+        at least by the gaps of a state, at most by half of D.
 
         Raises:
             InputError: the obstacles leave no place.

@@ -54,7 +54,8 @@ class ObstacleSet:
         parts = [np.zeros(0) if grid is None else grid.coefficients.ravel() for grid in grids]
         firsts = np.cumsum([0, *(len(part) for part in parts)])
         nodes = [
-            (0,) * 4 if g is None else (*g.distances.shape, first) for g, first in zip(grids, firsts, strict=False)
+            (0,) * 4 if g is None else (*g.distances.shape, first)
+            for g, first in zip(grids, firsts, strict=False)
         ]
         low = [(0.0,) * 3 if grid is None else grid.low for grid in grids]
         arrays = {
@@ -64,16 +65,27 @@ class ObstacleSet:
             "nodes": np.array(nodes, dtype=np.int32),
             "coefficients": np.concatenate(parts),
         }
-        self._fixed = {name: torch.as_tensor(values, device=device) for name, values in arrays.items()}
+        self._fixed = {
+            name: torch.as_tensor(values, device=device) for name, values in arrays.items()
+        }
         self._reach = reach
         self._measurements: dict[tuple[int, int, int], _Measurement] = {}
 
     def at(self, place: torch.Tensor, turn: torch.Tensor, growth: torch.Tensor) -> Any:
         """Returns the obstacles at float64 poses, as a kernel argument that reads these tensors."""
-        return struct_of(kernels.Obstacles, **self._fixed, reach=self._reach, place=place, turn=turn, growth=growth)
+        return struct_of(
+            kernels.Obstacles,
+            **self._fixed,
+            reach=self._reach,
+            place=place,
+            turn=turn,
+            growth=growth,
+        )
 
     def distances(self, x: torch.Tensor, pose: Pose) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns signed distances (B, P, O) [m] and normals (B, P, O, 3) of positions (B, P, 3), differentiable."""
+        """Returns signed distances (B, P, O) [m] and normals (B, P, O, 3)
+        of positions (B, P, 3), differentiable.
+        """
         size = batch, points, count = (*x.shape[:2], pose.place.shape[1])
         if size not in self._measurements:
             self._measurements[size] = _Measurement(self, batch, points, count, x.device)
@@ -82,12 +94,21 @@ class ObstacleSet:
 
 
 class _Measurement(Launcher):
-    """Buffers and launches of `kernels.contact.signed_distances.measure` and its adjoint for one size of a batch."""
+    """Buffers and launches of `kernels.contact.signed_distances.measure`
+    and its adjoint for one size of a batch.
+    """
 
-    def __init__(self, shapes: ObstacleSet, batch: int, points: int, count: int, device: torch.device) -> None:
+    def __init__(
+        self, shapes: ObstacleSet, batch: int, points: int, count: int, device: torch.device
+    ) -> None:
         super().__init__(batch, device)
         self._size = (points, count)
-        self.inputs = [self.zeros(points, 3), self.zeros(count, 3), self.zeros(count, 3, 3), self.zeros(count)]
+        self.inputs = [
+            self.zeros(points, 3),
+            self.zeros(count, 3),
+            self.zeros(count, 3, 3),
+            self.zeros(count),
+        ]
         x, *pose = self.inputs
         self._given = [shapes.at(*pose), warp_view(x, wp.vec3d)]
         self.results, views = self._pair()
@@ -96,11 +117,17 @@ class _Measurement(Launcher):
     def _pair(self) -> tuple[list[torch.Tensor], list[Any]]:
         """Returns buffers of distances and normals, and Warp's views of them."""
         buffers = [self.zeros(*self._size), self.zeros(*self._size, 3)]
-        return buffers, [warp_view(buffer, kind) for buffer, kind in zip(buffers, (wp.float64, wp.vec3d), strict=True)]
+        return buffers, [
+            warp_view(buffer, kind)
+            for buffer, kind in zip(buffers, (wp.float64, wp.vec3d), strict=True)
+        ]
 
     @cached_property
     def adjoint(self) -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor, Any]:
-        """Buffers of derivatives by the results, by positions and by rotations, and the launch; made when needed."""
+        """Buffers of derivatives by the results, by positions and by rotations, and the launch.
+
+        Made when needed.
+        """
         by_results, views = self._pair()
         position, turn = self.zeros(*self._size, 3), self.zeros(*self._size, 3, 3)
         slopes = [warp_view(position, wp.vec3d), warp_view(turn, wp.mat33d)]
@@ -118,7 +145,9 @@ class _Distances(AdjointFunction):
 
     @override
     @staticmethod
-    def forward(ctx: Any, measurement: _Measurement, *tensors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(
+        ctx: Any, measurement: _Measurement, *tensors: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         with measurement.lock:
             for buffer, value in zip(measurement.inputs, tensors, strict=True):
                 buffer.copy_(value.detach())
@@ -135,9 +164,18 @@ class _Distances(AdjointFunction):
         measurement = ctx.measurement
         with measurement.lock:
             buffers, position, turn, command = measurement.adjoint
-            for buffer, value in zip((*measurement.inputs, *buffers), (*ctx.saved_tensors, *by_results), strict=True):
+            for buffer, value in zip(
+                (*measurement.inputs, *buffers), (*ctx.saved_tensors, *by_results), strict=True
+            ):
                 buffer.copy_(value)
             measurement.launch(command)
-            sums = (lambda: position.sum(2), lambda: -position.sum(1), lambda: turn.sum(1), lambda: -buffers[0].sum(1))
+            sums = (
+                lambda: position.sum(2),
+                lambda: -position.sum(1),
+                lambda: turn.sum(1),
+                lambda: -buffers[0].sum(1),
+            )
             needed = zip(sums, ctx.needs_input_grad[1:], strict=True)
-            return None, *(slope().to(by_results[0].dtype) if used else None for slope, used in needed)
+            return None, *(
+                slope().to(by_results[0].dtype) if used else None for slope, used in needed
+            )

@@ -21,13 +21,36 @@ class ContactTerm(Term):
     _kernels = kernels
 
     def __init__(
-        self, launcher: Launcher, sets: Sequence[PointSet], obstacles: Sequence[Obstacle], reach: float
+        self,
+        launcher: Launcher,
+        sets: Sequence[PointSet],
+        obstacles: Sequence[Obstacle],
+        reach: float,
     ) -> None:
         (s,) = sets
         assert isinstance(s.source, ContactPoints)
         p, o = s.n_points, len(obstacles)
-        names = (*POSE, GROWTH.name, STIFFNESS.name, FRICTION.name, "contact_slip", *FRICTION_VALUES, "contact_start")
-        shapes = ((o, 3), (o, 3, 3), (o,), (o,), (o,), (1,), (p, o), (p, o, 3), (p, o, 3), (s.n_vertices, 3))
+        names = (
+            *POSE,
+            GROWTH.name,
+            STIFFNESS.name,
+            FRICTION.name,
+            "contact_slip",
+            *FRICTION_VALUES,
+            "contact_start",
+        )
+        shapes = (
+            (o, 3),
+            (o, 3, 3),
+            (o,),
+            (o,),
+            (o,),
+            (1,),
+            (p, o),
+            (p, o, 3),
+            (p, o, 3),
+            (s.n_vertices, 3),
+        )
         super().__init__(launcher, sets, dict(zip(names, shapes, strict=True)))
         self._count, self._reach = o, reach
         self._shapes = ObstacleSet(tuple(obstacles), reach, launcher.device)
@@ -42,7 +65,9 @@ class ContactTerm(Term):
         names = {"coefficient": FRICTION.name} | {
             n.removeprefix("contact_"): n for n in ("contact_slip", *FRICTION_VALUES)
         }
-        friction = struct_of(kernels.Friction, **{field: self.values[name] for field, name in names.items()})
+        friction = struct_of(
+            kernels.Friction, **{field: self.values[name] for field, name in names.items()}
+        )
         area = warp_view(self._area, wp.float64)
         return [s.points, area, self._obstacles(), self.view(STIFFNESS.name), friction, positions]
 
@@ -54,7 +79,9 @@ class ContactTerm(Term):
     def bounds(self, origin: Any, positions: Any, share: Any) -> list[Any]:
         batch, (s,) = self.launcher, self.sets
         inputs = [warp_view(batch.active, wp.int32), s.points, self._obstacles(), origin, positions]
-        return [batch.record(kernels.bound, (batch.batch, s.n_points, self._count), inputs, [share])]
+        return [
+            batch.record(kernels.bound, (batch.batch, s.n_points, self._count), inputs, [share])
+        ]
 
     @override
     def curvature(self) -> torch.Tensor:
@@ -63,10 +90,22 @@ class ContactTerm(Term):
     @override
     def adjoint(self, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         batch, (s,), size = self.launcher, self.sets, (self.n_points, self._count)
-        names = ("place", "turn", "growth", "stiffness", "coefficient", "load", "normal", "reference")
+        names = (
+            "place",
+            "turn",
+            "growth",
+            "stiffness",
+            "coefficient",
+            "load",
+            "normal",
+            "reference",
+        )
         shapes = {"turn": (3, 3), **dict.fromkeys(("place", "normal", "reference"), (3,))}
         out = {name: batch.zeros(*size, *shapes.get(name, ())) for name in names}
-        inputs = [*self._arguments(s, warp_view(positions, wp.vec3d)), warp_view(direction, wp.vec3d)]
+        inputs = [
+            *self._arguments(s, warp_view(positions, wp.vec3d)),
+            warp_view(direction, wp.vec3d),
+        ]
         slopes = struct_of(kernels.Slopes, **out)
         command = batch.record(kernels.adjoint, (batch.batch, *size), inputs, [slopes])
 
@@ -74,6 +113,8 @@ class ContactTerm(Term):
             batch.launch(command)
             shared = zip((*POSE, GROWTH.name, STIFFNESS.name, FRICTION.name), names, strict=False)
             sums = {value: out[name].sum(1) for value, name in shared}
-            return sums | {name: out[name.removeprefix("contact_")].clone() for name in FRICTION_VALUES}
+            return sums | {
+                name: out[name.removeprefix("contact_")].clone() for name in FRICTION_VALUES
+            }
 
         return differentiate

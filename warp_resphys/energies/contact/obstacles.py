@@ -23,12 +23,14 @@ from ...mesh.readers import METRES
 from ...mesh.tetrahedra import read_shells
 from ...settings.contact import Box, Capsule, Cylinder, HalfSpace, Obstacle, Sphere, SurfaceFile
 
-# Bezier points of a cubic B-spline, and of its slope raised to the same degree, a third of a spacing below a node, at
-# it, and a third above, from the coefficients of the node before, itself and the one behind.
+# Bezier points of a cubic B-spline, and of its slope raised to the same degree, a third of a
+# spacing below a node, at it, and a third above, from the coefficients of the node before, itself
+# and the one behind.
 _VALUES = np.array([[2.0, 4.0, 0.0], [1.0, 4.0, 1.0], [0.0, 4.0, 2.0]]) / 6.0
 _SLOPES = np.array([[-5.0, 4.0, 1.0], [-3.0, 0.0, 3.0], [-1.0, -4.0, 5.0]]) / 6.0
 _CORNERS: Final = 64  # of a circle
-_PLATE: Final = (1.5, 0.02)  # edge and thickness of the plate that stands for a half-space, over the body's size
+# Edge and thickness of the plate that stands for a half-space, over the body's size.
+_PLATE: Final = (1.5, 0.02)
 
 
 def _float64(values: Any) -> FloatArray:
@@ -38,24 +40,31 @@ def _float64(values: Any) -> FloatArray:
 class DistanceGrid(Obstacle):
     """Any shape, by its signed distances at the nodes of a grid, interpolated by cubic B-splines.
 
-    Edges are rounded over about a spacing. Around the grid, the distance is that from it and ``margin``.
+    Edges are rounded over about a spacing. Around the grid, the distance is that from it and
+    ``margin``.
 
     Raises:
-        InputError: fewer than eight nodes along an axis, values that are not finite, or distances at the boundary that
-            are not positive.
+        InputError: fewer than eight nodes along an axis, values that are not finite, or distances
+            at the boundary that are not positive.
     """
 
     distances: Annotated[Any, BeforeValidator(_float64)]  # (I, J, K) [m]
     spacing: Positive = setting(description="of the nodes", unit="m")
-    low: Vector = setting(description="place of the first node in the axes of the obstacle", unit="m")
+    low: Vector = setting(
+        description="place of the first node in the axes of the obstacle", unit="m"
+    )
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
         shape = self.distances.shape
         if len(shape) != 3 or min(shape) < 8 or not np.isfinite(self.distances).all():
-            raise ValueError(f"distances has shape {shape}: give finite distances at 8 nodes or more by 3 axes.")
+            raise ValueError(
+                f"distances has shape {shape}: give finite distances at 8 nodes or more by 3 axes."
+            )
         if not self.margin > 0.0:
-            raise ValueError("distances reach zero at the boundary of the grid: let it end outside of the shape.")
+            raise ValueError(
+                "distances reach zero at the boundary of the grid: let it end outside of the shape."
+            )
         return self
 
     @override
@@ -76,7 +85,9 @@ class DistanceGrid(Obstacle):
     @cached_property
     def coefficients(self) -> FloatArray:
         """(I, J, K) coefficients of the B-splines [m]."""
-        return np.asarray(scipy.ndimage.spline_filter(self.distances, 3, output=np.float64, mode="mirror"))
+        return np.asarray(
+            scipy.ndimage.spline_filter(self.distances, 3, output=np.float64, mode="mirror")
+        )
 
     @cached_property
     def largest_slope(self) -> float:
@@ -100,7 +111,12 @@ class DistanceGrid(Obstacle):
 
     @classmethod
     def of_surface(
-        cls, vertices: ArrayLike, triangles: ArrayLike, spacing: float, margin: float | None = None, **pose: Any
+        cls,
+        vertices: ArrayLike,
+        triangles: ArrayLike,
+        spacing: float,
+        margin: float | None = None,
+        **pose: Any,
     ) -> "DistanceGrid":
         """Returns the grid of a closed surface.
 
@@ -108,8 +124,8 @@ class DistanceGrid(Obstacle):
             vertices: (N, 3) in the axes of the obstacle [m].
             triangles: (T, 3) counter-clockwise seen from outside.
             spacing: of the nodes [m]: half of the smallest radius, or less.
-            margin: by which the grid is larger than the surface; ten spacings if omitted, as the boundary disturbs the
-                interpolation over some spacings [m].
+            margin: by which the grid is larger than the surface; ten spacings if omitted, as the
+                boundary disturbs the interpolation over some spacings [m].
             pose: position, axis and ``moves``.
 
         Raises:
@@ -119,17 +135,21 @@ class DistanceGrid(Obstacle):
 
         surface = trimesh.Trimesh(np.asarray(vertices), np.asarray(triangles))
         if not surface.is_watertight:
-            raise InputError("the surface of the obstacle is not closed, so that it has no inside: repair it.")
+            raise InputError(
+                "the surface of the obstacle is not closed, so that it has no inside: repair it."
+            )
         if not (surface.is_winding_consistent and surface.volume > 0.0):
             raise InputError(
-                "the triangles of the obstacle are not all counter-clockwise seen from outside: reverse those that are "
-                "not."
+                "the triangles of the obstacle are not all counter-clockwise seen from outside: "
+                "reverse those that are not."
             )
         width = (10.0 * spacing if margin is None else margin) + 2.0 * spacing
         low, high = surface.bounds + np.array([[-width], [width]])
         shape = np.ceil((high - low) / spacing).astype(int) + 1
         nodes = low + spacing * np.moveaxis(np.indices(shape), 0, -1)
-        distances = signed_distances(surface.vertices, surface.faces, nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
+        distances = signed_distances(surface.vertices, surface.faces, nodes.reshape(-1, 3)).reshape(
+            nodes.shape[:3]
+        )
         return cls(distances=distances, spacing=spacing, low=(low[0], low[1], low[2]), **pose)
 
     @classmethod
@@ -141,7 +161,9 @@ class DistanceGrid(Obstacle):
         """
         vertices, shells = read_shells(Path(file.path).expanduser())
         pose = {"position": file.position, "axis": file.axis, "moves": file.moves}
-        return cls.of_surface(METRES[file.units] * vertices, np.concatenate(shells), file.spacing, margin, **pose)
+        return cls.of_surface(
+            METRES[file.units] * vertices, np.concatenate(shells), file.spacing, margin, **pose
+        )
 
 
 # Kinds of the kernels.
@@ -156,7 +178,8 @@ KINDS: Final[Mapping[type[Obstacle], int]] = {
 
 
 def signed_distances(vertices: ArrayLike, triangles: ArrayLike, places: ArrayLike) -> FloatArray:
-    """Returns the distances (P,) of places (P, 3) from a closed surface, negative inside of it, in float32 [m].
+    """Returns the distances (P,) of places (P, 3) from a closed surface,
+    negative inside of it, in float32 [m].
 
     Args:
         vertices: (N, 3) [m].
@@ -175,8 +198,11 @@ def signed_distances(vertices: ArrayLike, triangles: ArrayLike, places: ArrayLik
     return np.asarray(out.numpy(), dtype=np.float64)
 
 
-def surface_of(obstacle: Obstacle, growth: float, beside: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Returns points (P, 3) [m] and triangles (S, 3) of an obstacle in its axes, with normals that point outwards.
+def surface_of(
+    obstacle: Obstacle, growth: float, beside: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Returns points (P, 3) [m] and triangles (S, 3) of an obstacle in its axes,
+    with normals that point outwards.
 
     Args:
         obstacle: its shape.
@@ -193,10 +219,8 @@ def surface_of(obstacle: Obstacle, growth: float, beside: FloatArray) -> tuple[F
         case HalfSpace():
             edge, thickness = np.multiply(_PLATE, np.ptp(beside, axis=0).max())
             middle = (beside.mean(axis=0) - obstacle.position) @ obstacle.turn
-            solid, place = (
-                trimesh.creation.box((edge, edge, thickness)),
-                np.append(middle[:2], growth - 0.5 * thickness),
-            )
+            solid = trimesh.creation.box((edge, edge, thickness))
+            place = np.append(middle[:2], growth - 0.5 * thickness)
         case Box():
             solid = trimesh.creation.box(2.0 * (np.array([x, y, z]) + growth))
         case Sphere():
@@ -207,13 +231,19 @@ def surface_of(obstacle: Obstacle, growth: float, beside: FloatArray) -> tuple[F
             solid = trimesh.creation.cylinder(x + growth, 2.0 * (z + growth), sections=_CORNERS)
         case _:
             raise TypeError(f"{type(obstacle).__name__} has no surface to draw")
-    return np.asarray(solid.vertices - solid.bounds.mean(axis=0) + place), np.asarray(solid.faces, dtype=np.int64)
+    return np.asarray(solid.vertices - solid.bounds.mean(axis=0) + place), np.asarray(
+        solid.faces, dtype=np.int64
+    )
 
 
 def _contour(grid: DistanceGrid, growth: float) -> tuple[FloatArray, IntArray]:
-    """Returns the points (P, 3) [m] and triangles (S, 3) at a distance from the surface of a grid."""
+    """The points (P, 3) [m] and triangles (S, 3) at a distance from the surface of a grid."""
     import pyvista
 
-    image = pyvista.ImageData(dimensions=grid.distances.shape, spacing=(grid.spacing,) * 3, origin=grid.low)
+    image = pyvista.ImageData(
+        dimensions=grid.distances.shape, spacing=(grid.spacing,) * 3, origin=grid.low
+    )
     surface = image.contour([growth], scalars=grid.distances.ravel(order="F"))
-    return np.asarray(surface.points, dtype=float), np.asarray(surface.faces, dtype=np.int64).reshape(-1, 4)[:, :0:-1]
+    return np.asarray(surface.points, dtype=float), np.asarray(
+        surface.faces, dtype=np.int64
+    ).reshape(-1, 4)[:, :0:-1]

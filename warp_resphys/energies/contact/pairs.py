@@ -20,7 +20,8 @@ from .obstacles import signed_distances
 _FIRST_CAPACITY = 4096
 _REBUILT = 100  # Uses of a hierarchy of boxes after which it is made anew.
 _SPARE = 0.75  # radius around the middle of a way within which pairs are sought, over its length
-_PARALLEL = 1e-3  # |a x b|^2 over |a|^2 |b|^2 at rest below which edges count as almost parallel (Li et al. 2020)
+# |a x b|^2 over |a|^2 |b|^2 at rest below which edges count as almost parallel (Li et al. 2020)
+_PARALLEL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -53,12 +54,19 @@ class Surface:
     def of(cls, mesh: Mesh) -> "Surface":
         """Returns the surface of a mesh."""
         triangles, x = boundary_triangles(mesh).astype(np.int64), mesh.vertices
-        edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+        edges = np.unique(
+            np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0
+        )
         areas = 0.5 * np.linalg.norm(
-            np.cross(x[triangles[:, 1]] - x[triangles[:, 0]], x[triangles[:, 2]] - x[triangles[:, 0]]), axis=1
+            np.cross(
+                x[triangles[:, 1]] - x[triangles[:, 0]], x[triangles[:, 2]] - x[triangles[:, 0]]
+            ),
+            axis=1,
         )
         cells = np.repeat(mesh.cells[:, :1], mesh.cells.shape[1], axis=1)
-        graph = scipy.sparse.coo_array((np.ones(cells.size), (cells.ravel(), mesh.cells.ravel())), (len(x), len(x)))
+        graph = scipy.sparse.coo_array(
+            (np.ones(cells.size), (cells.ravel(), mesh.cells.ravel())), (len(x), len(x))
+        )
         _, pieces = scipy.sparse.csgraph.connected_components(graph, directed=False)
         degree, owners = np.bincount(triangles.ravel(), minlength=len(x)), np.full(len(x), -1)
         for number, region in reversed(list(enumerate(mesh.regions.values()))):
@@ -73,12 +81,18 @@ class Surface:
         def pad(values: NDArray[Any]) -> NDArray[Any]:
             return np.pad(values, [(first, after), *[(0, 0)] * (values.ndim - 1)])
 
-        fields: dict[str, Any] = {name: getattr(self, name) + first for name in ("vertices", "triangles", "edges")}
-        fields |= {name: pad(getattr(self, name)) for name in ("degree", "pieces", "rest", "owners")}
+        fields: dict[str, Any] = {
+            name: getattr(self, name) + first for name in ("vertices", "triangles", "edges")
+        }
+        fields |= {
+            name: pad(getattr(self, name)) for name in ("degree", "pieces", "rest", "owners")
+        }
         return replace(self, **fields)
 
     def words(self, vertex: int) -> str:
-        """Returns a vertex in words: its number among all vertices, and the name of its body or region."""
+        """Returns a vertex in words: its number among all vertices,
+        and the name of its body or region.
+        """
         owner = int(self.owners[vertex])
         return f"vertex {vertex}" + (f" in {self.names[owner]!r}" if owner >= 0 else "")
 
@@ -122,7 +136,7 @@ class _Hierarchy:
 
 
 class PairList:
-    """Pairs of a batch that may come within reach, with the positions and radii for which that holds.
+    """Pairs of a batch that may come within reach, with positions and radii for which that holds.
 
     Args:
         launcher: launcher of the potential.
@@ -153,8 +167,12 @@ class PairList:
         self._pieces = tensor(surface.pieces)
         pieces = self._pieces[self.vertices]
         # Weights of the mean over every piece, and in the last row over all.
-        self._means = torch.zeros(int(surface.pieces.max()) + 2, n, device=device, dtype=torch.float64)
-        self._means[pieces, self.vertices] = 1.0 / torch.bincount(pieces, minlength=len(self._means))[pieces].double()
+        self._means = torch.zeros(
+            int(surface.pieces.max()) + 2, n, device=device, dtype=torch.float64
+        )
+        self._means[pieces, self.vertices] = (
+            1.0 / torch.bincount(pieces, minlength=len(self._means))[pieces].double()
+        )
         self._means[-1, self.vertices] = 1.0 / len(pieces)
         self._degree = tensor(surface.degree, torch.float64)
         # Both surfaces in contact have vertices, for half of its area, and edges, for an eighth.
@@ -162,7 +180,8 @@ class PairList:
         self._edge_area = tensor(0.125 * surface.edge_areas(), torch.float64)
         self._rest = tensor(surface.rest, torch.float64)
         self._triangle_array, self._edge_array = (
-            launcher.upload(part.astype(np.int32), int) for part in (surface.triangles, surface.edges)
+            launcher.upload(part.astype(np.int32), int)
+            for part in (surface.triangles, surface.edges)
         )
         self._piece_array = launcher.upload(surface.pieces.astype(np.int32), int)
         self.vertex_array = launcher.upload(surface.vertices.astype(np.int32), int)
@@ -189,17 +208,26 @@ class PairList:
         return self._ways(ways)[0][:, self.vertices]
 
     def _ways(self, ways: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns lengths (B, N) of ways (B, N, 3) relative to the mean of all, and to that of their piece [m]."""
+        """Returns lengths (B, N) of ways (B, N, 3) relative to the mean of all,
+        and to that of their piece [m].
+        """
         mean = torch.einsum("cn,bnk->bck", self._means, ways)
         return (ways - mean[:, -1:]).norm(dim=-1), (ways - mean[:, self._pieces]).norm(dim=-1)
 
     def find(self, origin: torch.Tensor, ways: torch.Tensor) -> None:
-        """Makes the list for positions (B, N, 3) and ways (B, N, 3) from there, around the middle of these [m]."""
+        """Makes the list for positions (B, N, 3) and ways (B, N, 3) from there,
+        around the middle of these [m].
+        """
         launcher, surface = self._launcher, self.surface
         outer, inner = (_SPARE * size + self._least_radius for size in self._ways(ways))
         self._origin, self._outer, self._inner = origin + 0.5 * ways, outer, inner
         motion = struct_of(
-            broad_phase.Sweep, origin=self._origin, outer=outer, inner=inner, piece=self._piece_array, reach=self.reach
+            broad_phase.Sweep,
+            origin=self._origin,
+            outer=outer,
+            inner=inner,
+            piece=self._piece_array,
+            reach=self.reach,
         )
         size = len(surface.vertices) * len(surface.triangles)
         total, vertices = size + len(surface.edges) ** 2, self.vertex_array.reshape((-1, 1))
@@ -214,14 +242,16 @@ class PairList:
             pair_keys = struct_of(broad_phase.PairKeys, count=count, keys=keys)
             for kind, (tree, first, second, offset) in enumerate(searches):
                 inputs = [kind, tree.id, motion, first, second, wp.int64(offset), wp.int64(total)]
-                launcher.run(broad_phase.close_pairs, (launcher.batch, first.shape[0]), inputs, [pair_keys])
+                launcher.run(
+                    broad_phase.close_pairs, (launcher.batch, first.shape[0]), inputs, [pair_keys]
+                )
             if (needed := int(count)) <= self._capacity:
                 break
             self._capacity = 2 * needed  # The list is made again.
         self._set(keys[:needed].sort().values, size, total)
 
     def _hierarchy(self, motion: Any, nodes: Any) -> Any:
-        """Returns boxes of triangles or edges of all environments, valid until they are sought again.
+        """Boxes of triangles or edges of all environments, valid until they are sought again.
 
         Bodies keep together, so that a hierarchy serves for many positions.
         """
@@ -229,9 +259,13 @@ class PairList:
         size, used = launcher.batch * nodes.shape[0], self._hierarchies.get(nodes.ptr)
         if used is None:
             with shareable():
-                arrays = [wp.empty(size, dtype=kind, device=device) for kind in (wp.vec3, wp.vec3, int)]
+                arrays = [
+                    wp.empty(size, dtype=kind, device=device) for kind in (wp.vec3, wp.vec3, int)
+                ]
             used = self._hierarchies[nodes.ptr] = _Hierarchy(arrays)
-        launcher.run(broad_phase.boxes, (launcher.batch, nodes.shape[0]), [motion, nodes], used.arrays)
+        launcher.run(
+            broad_phase.boxes, (launcher.batch, nodes.shape[0]), [motion, nodes], used.arrays
+        )
         with shareable(), wp.ScopedStream(launch_stream(launcher.device)):
             return used.fitted()
 
@@ -246,7 +280,9 @@ class PairList:
         second = torch.cat([self._edges[e], self._edges[f]], 1)
         self.nodes = torch.where(vertex[:, None], first, second)
         self.environment, self.kind = environment, (~vertex).int()
-        self.area = torch.where(vertex, self._vertex_area[first[:, 0]], self._edge_area[e] + self._edge_area[f])
+        self.area = torch.where(
+            vertex, self._vertex_area[first[:, 0]], self._edge_area[e] + self._edge_area[f]
+        )
         self.degree = self._degree[self.nodes]
         a, b = (self._rest[self.nodes[:, k + 1]] - self._rest[self.nodes[:, k]] for k in (0, 2))
         self.parallel = _PARALLEL * a.square().sum(1) * b.square().sum(1)
@@ -255,10 +291,16 @@ class PairList:
         whole = {"environment": self.environment, "kind": self.kind, "nodes": self.nodes}
         whole = {name: value.to(torch.int32).contiguous() for name, value in whole.items()}
         self.pairs = struct_of(
-            nearest_points.Pairs, **whole, area=self.area, degree=self.degree, parallel=self.parallel
+            nearest_points.Pairs,
+            **whole,
+            area=self.area,
+            degree=self.degree,
+            parallel=self.parallel,
         )
 
-    def incidence(self, environment: torch.Tensor, nodes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def incidence(
+        self, environment: torch.Tensor, nodes: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns `start` and `incident` of pairs (C,) and (C, 4)."""
         size = len(self.vertices)
         row = (environment[:, None] * size + self._local[nodes]).ravel()
@@ -272,11 +314,14 @@ class PairList:
         out = torch.zeros(self.count, device=launcher.device, dtype=torch.float64)
         if self.count:
             inputs = [self.pairs, warp_view(kept, wp.vec3d)]
-            launcher.run(nearest_points.distances, (self.count,), inputs, [warp_view(out, wp.float64)])
+            launcher.run(
+                nearest_points.distances, (self.count,), inputs, [warp_view(out, wp.float64)]
+            )
         return out
 
     def check_apart(self, positions: torch.Tensor, when: str, advice: str) -> None:
-        """Raises InputError where surfaces cross at positions (B, N, 3), or a body is within another one.
+        """Raises InputError where surfaces cross at positions (B, N, 3),
+        or a body is within another one.
 
         Args:
             positions: of the vertices [m].
@@ -292,20 +337,31 @@ class PairList:
         if bool((enclosed >= 0).any()):
             b = int(enclosed[:, 0].argmax())
             inside, outer = map(self.surface.words, enclosed[b].tolist())
-            raise InputError(f"a body with {inside} is within that with {outer} {when.format(b)}: {advice}.")
+            raise InputError(
+                f"a body with {inside} is within that with {outer} {when.format(b)}: {advice}."
+            )
 
     def crossing(self, positions: torch.Tensor, edge: int) -> str:
-        """Returns in words what an edge that passes through a triangle shows at positions (N, 3) [m]."""
+        """Returns in words what an edge that passes through a triangle shows
+        at positions (N, 3) [m].
+        """
         start, end = positions[self._edges[edge]]
         a, b, c = positions[self._triangles].unbind(1)
         normal = torch.linalg.cross(b - a, c - a)
         below, above = (((x - a) * normal).sum(-1) for x in (start, end))
         at = start + (below / (below - above))[:, None] * (end - start)
-        sides = [(torch.linalg.cross(q - p, at - p) * normal).sum(-1) for p, q in ((a, b), (b, c), (c, a))]
+        sides = [
+            (torch.linalg.cross(q - p, at - p) * normal).sum(-1)
+            for p, q in ((a, b), (b, c), (c, a))
+        ]
         through = (torch.stack(sides) >= 0.0).all(0) & (below * above <= 0.0)
         through &= ~torch.isin(self._triangles, self._edges[edge]).any(1)
-        vertex, other = int(self._edges[edge, 0]), int(self._triangles[int(through.int().argmax()), 0])
-        words = f"an edge at {self.surface.words(vertex)} passes through a triangle at {self.surface.words(other)}"
+        vertex = int(self._edges[edge, 0])
+        other = int(self._triangles[int(through.int().argmax()), 0])
+        words = (
+            f"an edge at {self.surface.words(vertex)} passes through a triangle at "
+            f"{self.surface.words(other)}"
+        )
         depth, deepest = 0.0, -1
         pieces = self._pieces[[vertex, other]].tolist()
         for one, two in (pieces, pieces[::-1]) if pieces[0] != pieces[1] else ():
@@ -317,37 +373,58 @@ class PairList:
             words += f"; deepest is {self.surface.words(deepest)}, by {1e3 * depth:.3g} mm"
         return words
 
-    def _distances(self, positions: torch.Tensor, piece: int, vertices: torch.Tensor) -> NDArray[np.float64]:
-        """Returns the distances (V,) of vertices (V,) from a piece, negative within it, at positions (N, 3) [m]."""
+    def _distances(
+        self, positions: torch.Tensor, piece: int, vertices: torch.Tensor
+    ) -> NDArray[np.float64]:
+        """Returns the distances (V,) of vertices (V,) from a piece,
+        negative within it, at positions (N, 3) [m].
+        """
         triangles = self._triangles[self._pieces[self._triangles[:, 0]] == piece]
         x = positions.cpu()
         return signed_distances(x, triangles.cpu(), x[vertices.cpu()])
 
     def enclosed(self, positions: torch.Tensor) -> torch.Tensor:
-        """Returns (B, 2) a vertex of a piece within another one, and a vertex of that; -1 where there is none.
+        """Returns (B, 2) a vertex of a piece within another one, and a vertex of that.
+
+        -1 where there is none.
 
         Surfaces must not cross.
         """
         out = torch.full((len(positions), 2), -1, device=positions.device)
         pieces = self._pieces[self.vertices].unique()
         of = [positions[:, self.vertices[self._pieces[self.vertices] == piece]] for piece in pieces]
-        low, high = torch.stack([x.amin(1) for x in of], 1), torch.stack([x.amax(1) for x in of], 1)  # (B, pieces, 3)
-        contained = (low[:, :, None] > low[:, None]).all(-1) & (high[:, :, None] < high[:, None]).all(-1)
+        # (B, pieces, 3)
+        low, high = torch.stack([x.amin(1) for x in of], 1), torch.stack([x.amax(1) for x in of], 1)
+        contained = (low[:, :, None] > low[:, None]).all(-1) & (
+            high[:, :, None] < high[:, None]
+        ).all(-1)
         for b, one, two in contained.nonzero().tolist():
-            vertices = [self.vertices[self._pieces[self.vertices] == pieces[piece]][:1] for piece in (one, two)]
+            vertices = [
+                self.vertices[self._pieces[self.vertices] == pieces[piece]][:1]
+                for piece in (one, two)
+            ]
             if self._distances(positions[b], int(pieces[two]), vertices[0])[0] < 0.0:
                 out[b] = torch.cat(vertices)
         return out
 
     def crossings(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the number (B,) of edges that pass through a triangle, and the first of them (B,)."""
+        """Returns the number (B,) of edges that pass through a triangle,
+        and the first of them (B,).
+        """
         launcher = self._launcher
-        motion = struct_of(broad_phase.Sweep, origin=positions.contiguous(), outer=launcher.zeros(positions.shape[1]))
+        motion = struct_of(
+            broad_phase.Sweep,
+            origin=positions.contiguous(),
+            outer=launcher.zeros(positions.shape[1]),
+        )
         hierarchy = self._hierarchy(motion, self._triangle_array)
         count, edge = (
-            torch.full((launcher.batch,), k, device=launcher.device, dtype=torch.int32) for k in (0, 2**31 - 1)
+            torch.full((launcher.batch,), k, device=launcher.device, dtype=torch.int32)
+            for k in (0, 2**31 - 1)
         )
         inputs = [hierarchy.id, motion, self._edge_array, self._triangle_array]
         outputs = [warp_view(count, wp.int32), warp_view(edge, wp.int32)]
-        launcher.run(broad_phase.crossings, (launcher.batch, len(self.surface.edges)), inputs, outputs)
+        launcher.run(
+            broad_phase.crossings, (launcher.batch, len(self.surface.edges)), inputs, outputs
+        )
         return count, edge

@@ -1,18 +1,21 @@
-r"""Contact of bodies with one another and with themselves: a barrier between surfaces, and Coulomb friction.
+r"""Contact of bodies with one another and with themselves:
+a barrier between surfaces, and Coulomb friction.
 
-A surface consists of triangles. A vertex and a triangle, or two edges, at the distance d < D, have the energy
+A surface consists of triangles. A vertex and a triangle, or two edges, at the distance d < D, have
+the energy
 
     a kappa D B(d / D),     B(s) = -(s - 1)^2 ln s,
 
-with the area a that the pair stands for, and friction as in `energies.contact`: with the normal force, the normal and
-the nearest points of the start of a step, it acts against the relative slide of these points since then. Where the
-nearest point is on an edge or at a vertex that several triangles have in common, their energies are summed so that it
-counts once (inclusion and exclusion). Edges that are almost parallel have a factor that vanishes for parallel ones,
-where their nearest points are not unique (incremental potential contact; Li et al. 2020).
+with the area a that the pair stands for, and friction as in `energies.contact`: with the normal
+force, the normal and the nearest points of the start of a step, it acts against the relative slide
+of these points since then. Where the nearest point is on an edge or at a vertex that several
+triangles have in common, their energies are summed so that it counts once (inclusion and
+exclusion). Edges that are almost parallel have a factor that vanishes for parallel ones, where
+their nearest points are not unique (incremental potential contact; Li et al. 2020).
 
-In contact of two surfaces, the vertices of both stand for half of the area each, and their edges for an eighth. Where
-meshes match, the pressure at a gap is that of an obstacle; edges that cross add to it. Triangles and edges that share a
-vertex are no pair.
+In contact of two surfaces, the vertices of both stand for half of the area each, and their edges
+for an eighth. Where meshes match, the pressure at a gap is that of an obstacle; edges that cross
+add to it. Triangles and edges that share a vertex are no pair.
 
 M. Li et al.: Incremental potential contact. ACM Transactions on Graphics 39 (4), 2020.
 """
@@ -44,10 +47,11 @@ _LEAST: Final = 1e-4  # share of D within which surfaces count as touching
 
 @dataclass(frozen=True)
 class SurfaceContact(Energy):
-    """Contact of a body with itself or, as `Scene.contact`, of all bodies with one another and with themselves.
+    """Contact of a body with itself or, as `Scene.contact`,
+    of all bodies with one another and with themselves.
 
-    Parameters are ``surface_stiffness`` [Pa] and ``surface_friction`` (equations in the module's docstring), which has
-    one value, or where `pairs` are given that of all others and then theirs.
+    Parameters are ``surface_stiffness`` [Pa] and ``surface_friction`` (equations in the module's
+    docstring), which has one value, or where `pairs` are given that of all others and then theirs.
 
     Raises:
         InputError: a value out of range.
@@ -59,24 +63,27 @@ class SurfaceContact(Energy):
     friction: Parameter = 0.0  # mu
     distance: float = 1e-3  # D [m]
     slip_speed: float = 1e-3  # v_s [m/s]
-    pairs: Mapping[str, FrictionPair] = field(default_factory=dict)  # by name, the first one that fits
+    pairs: Mapping[str, FrictionPair] = field(default_factory=dict)  # by name; the first that fits
 
     def __post_init__(self) -> None:
         """Checks the values."""
         for name in ("distance", "slip_speed"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise InputError(
-                    f"{name} of a contact between surfaces is {getattr(self, name):g}: it must be positive."
+                    f"{name} of a contact between surfaces is {getattr(self, name):g}: "
+                    "it must be positive."
                 )
         STIFFNESS.check(self.stiffness)
         FRICTION.check(self.friction)
         if not isinstance(self.pairs, Mapping) or "other" in self.pairs:
             raise InputError(
-                f"pairs of a contact between surfaces are {self.pairs!r}: give FrictionPair(...) by name, other than "
-                "'other', which stands for all surfaces that are in no pair."
+                f"pairs of a contact between surfaces are {self.pairs!r}: give FrictionPair(...) "
+                "by name, other than 'other', which stands for all surfaces that are in no pair."
             )
         if self.pairs and not isinstance(self.friction, float | int):
-            raise InputError("contact of surfaces with pairs has one number as the friction of all others.")
+            raise InputError(
+                "contact of surfaces with pairs has one number as the friction of all others."
+            )
 
     @property
     @override
@@ -113,7 +120,9 @@ class SurfaceContact(Energy):
             for members, region in zip(row, (pair.first, pair.second), strict=True):
                 with naming(f"the pair {name!r} of a contact between surfaces: "):
                     members[mesh.cells[mesh.region(region)]] = True
-        return (SurfacePoints(vertices[:, None], np.ones((len(vertices), 1, 1, 1)), surface, regions),)
+        return (
+            SurfacePoints(vertices[:, None], np.ones((len(vertices), 1, 1, 1)), surface, regions),
+        )
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "SurfaceTerm":
@@ -136,8 +145,8 @@ class BoundSurfaceContact(BoundEnergy):
         members = body.bodies.values() if isinstance(body, Scene) else (body,)
         if any(member.glued or member.symmetry for member in members):
             raise InputError(
-                "contact between surfaces does not support symmetry planes or glue, where the boundary of a mesh is no "
-                "surface: leave them out."
+                "contact between surfaces does not support symmetry planes or glue, where the "
+                "boundary of a mesh is no surface: leave them out."
             )
         (points,) = site.points
         assert isinstance(points, SurfacePoints)
@@ -147,7 +156,9 @@ class BoundSurfaceContact(BoundEnergy):
         self._check_rest(pairs, rest.double()[None])
 
     def _check_rest(self, pairs: PairList, rest: torch.Tensor) -> None:
-        """Raises InputError where surfaces cross or touch at rest, or parts of a piece are within reach of others."""
+        """Raises InputError where surfaces cross or touch at rest,
+        or parts of a piece are within reach of others.
+        """
         words = pairs.surface.words
         pairs.check_apart(rest, "at rest", "move the bodies apart, or mend the mesh")
         pairs.find(rest, torch.zeros_like(rest))
@@ -156,16 +167,18 @@ class BoundSurfaceContact(BoundEnergy):
         if len(gaps) and float(gaps.min()) < _LEAST * self._contact.distance:
             nearest = int(gaps.argmin())
             raise InputError(
-                f"surfaces touch at rest, at {words(int(ends[nearest, 0]))} and {words(int(ends[nearest, 3]))}: leave "
-                "a gap of about contact's distance between bodies."
+                f"surfaces touch at rest, at {words(int(ends[nearest, 0]))} and "
+                f"{words(int(ends[nearest, 3]))}: "
+                "leave a gap of about contact's distance between bodies."
             )
         close = (gaps < self._contact.distance) & (piece[ends[:, 0]] == piece[ends[:, 3]])
         if bool(close.any()):
             worst = int(torch.where(close, gaps, torch.inf).argmin())
             raise InputError(
-                f"contact between surfaces begins at {1e3 * self._contact.distance:g} mm, but at rest the surface of a "
-                f"body is {1e3 * float(gaps[worst]):.3g} mm from itself, between {words(int(ends[worst, 0]))} and "
-                f"{words(int(ends[worst, 3]))}: take a smaller distance."
+                f"contact between surfaces begins at {1e3 * self._contact.distance:g} mm, but at "
+                f"rest the surface of a body is {1e3 * float(gaps[worst]):.3g} mm from itself, "
+                f"between {words(int(ends[worst, 0]))} and {words(int(ends[worst, 3]))}: take a "
+                "smaller distance."
             )
 
     @override
@@ -182,13 +195,25 @@ class BoundSurfaceContact(BoundEnergy):
     def forces(self, step: EnergyStep, x: torch.Tensor) -> ContactForces:
         """Returns the forces at the solution x (B, N, 3) of a step's implicit stage [m].
 
-        Gaps are the least of a vertex, the distance at which contact begins where none is nearer; slides the largest.
+        Gaps are the least of a vertex, the distance at which contact begins where none is nearer;
+        slides the largest.
         """
         assert isinstance(step.term, SurfaceTerm)
-        shared = {q.name: step.value(q.name).expand(step.state.batch, -1) for q in (STIFFNESS, FRICTION)}
-        values = {n: v.double() for n, v in {**shared, **self.begin_step(step)}.items() if v is not None}
+        shared = {
+            q.name: step.value(q.name).expand(step.state.batch, -1) for q in (STIFFNESS, FRICTION)
+        }
+        values = {
+            n: v.double() for n, v in {**shared, **self.begin_step(step)}.items() if v is not None
+        }
         gap, normal, friction, slide = (out.to(x) for out in step.term.forces(values, x.double()))
         sticks = (slide >= 0.0) & (slide < value_of(values, "surface_slip").to(x))
         return ContactForces(
-            (), self._vertices, gap, normal, friction, slide.clamp_min(0.0), sticks, x[:, self._vertices]
+            (),
+            self._vertices,
+            gap,
+            normal,
+            friction,
+            slide.clamp_min(0.0),
+            sticks,
+            x[:, self._vertices],
         )

@@ -20,20 +20,27 @@ class NearPairs(NamedTuple):
 
     environment: torch.Tensor  # (A,)
     nodes: torch.Tensor  # (A, 4)
-    weights: torch.Tensor  # (A, 9, 4) of the nearest points, by feature (``kernels.contact.nearest_points.nearest``)
+    weights: torch.Tensor  # (A, 9, 4) of nearest points by feature (`nearest_points.nearest`)
     r: torch.Tensor  # (A, 9, 3) from the nearest point of the second part to that of the first [m]
     d: torch.Tensor  # (A, 9) its length [m]
     part: torch.Tensor  # (A, 9) coefficients of the features
     factor: torch.Tensor  # (A,) area, with the factor for almost parallel edges [m^2]
 
     @classmethod
-    def of(cls, launcher: Launcher, pairs: PairList, chosen: torch.Tensor, x: torch.Tensor) -> "NearPairs":
+    def of(
+        cls, launcher: Launcher, pairs: PairList, chosen: torch.Tensor, x: torch.Tensor
+    ) -> "NearPairs":
         """Returns the geometry of chosen pairs of a list at positions (B, N, 3), differentiable."""
         indices = chosen.to(torch.int32)
         w, t, s = (x.new_zeros(len(chosen), _FEATURES, 4) for _ in range(3))
         part = x.new_zeros(len(chosen), _FEATURES)
         features = struct_of(nearest_points.Features, coefficient=part, w=w, t=t, s=s)
-        inputs = [warp_view(indices, wp.int32), pairs.pairs, wp.float64(pairs.reach), warp_view(x, wp.vec3d)]
+        inputs = [
+            warp_view(indices, wp.int32),
+            pairs.pairs,
+            wp.float64(pairs.reach),
+            warp_view(x, wp.vec3d),
+        ]
         launcher.run(nearest_points.pair_features, (len(chosen), _FEATURES), inputs, [features])
         environment, nodes = pairs.environment[chosen], pairs.nodes[chosen]
         ends = x[environment[:, None], nodes]
@@ -46,9 +53,13 @@ class NearPairs(NamedTuple):
         first, second = (fr * ef - er * ff) / whole, (er * ef - fr * ee) / whole
         w = w + first[..., None] * t + second[..., None] * s
         r = w @ ends
-        cross = torch.linalg.cross(ends[:, 1] - ends[:, 0], ends[:, 3] - ends[:, 2]).square().sum(-1)
+        cross = (
+            torch.linalg.cross(ends[:, 1] - ends[:, 0], ends[:, 3] - ends[:, 2]).square().sum(-1)
+        )
         share = (cross / pairs.parallel[chosen]).clamp_max(1.0)
-        factor = torch.where(pairs.kind[chosen] == 0, 1.0, (2.0 - share) * share) * pairs.area[chosen]
+        factor = (
+            torch.where(pairs.kind[chosen] == 0, 1.0, (2.0 - share) * share) * pairs.area[chosen]
+        )
         return cls(environment, nodes, w, r, r.norm(dim=-1), part, factor)
 
 
@@ -63,7 +74,9 @@ class Sliding(NamedTuple):
     regions: torch.Tensor  # (G,) number of the coefficient
 
     @classmethod
-    def of(cls, near: NearPairs, reach: float, stiffness: torch.Tensor, regions: torch.Tensor) -> "Sliding | None":
+    def of(
+        cls, near: NearPairs, reach: float, stiffness: torch.Tensor, regions: torch.Tensor
+    ) -> "Sliding | None":
         """Returns the friction of pairs with these normal forces, or None without any that press.
 
         Args:
@@ -74,13 +87,19 @@ class Sliding(NamedTuple):
         """
         n, pressure = near.r / near.d[..., None], near.part * barrier_pressure(near.d, reach)
         normal = n[:, 0]
-        load = near.factor * stiffness[near.environment, 0] * ((pressure[..., None] * n).sum(1) * normal).sum(-1)
+        load = (
+            near.factor
+            * stiffness[near.environment, 0]
+            * ((pressure[..., None] * n).sum(1) * normal).sum(-1)
+        )
         kept = load > 0.0
         out = (near.environment, near.nodes, near.weights[:, 0], normal, load, regions)
         return cls(*(value[kept] for value in out)) if bool(kept.any()) else None
 
     def slide(self, x: torch.Tensor, reference: torch.Tensor) -> torch.Tensor:
-        """Returns the relative ways (G, 3) of both parts of pairs in their tangential planes [m] (see `force`)."""
+        """Returns the relative ways (G, 3) of both parts of pairs
+        in their tangential planes [m] (see `force`).
+        """
         row = self.environment[:, None]
         way = (self.weights[:, :, None] * (x[row, self.nodes] - reference[row, self.nodes])).sum(1)
         return way - (way * self.normal).sum(-1, keepdim=True) * self.normal

@@ -1,4 +1,6 @@
-"""Kernels of contact between surfaces, and derivatives of its friction by the state at the start of a step."""
+"""Kernels of contact between surfaces, and derivatives of its friction
+by the state at the start of a step.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -63,12 +65,20 @@ class SurfaceTerm(Term):
         (s,) = sets
         assert isinstance(s.source, SurfacePoints)
         members = s.source.members(s.n_vertices)
-        fields = dict.fromkeys(("surface_start", "surface_reference", "surface_place"), (s.n_vertices, 3))
-        shapes = {STIFFNESS.name: (1,), FRICTION.name: (1 + len(members),), "surface_slip": (1,), **fields}
+        fields = dict.fromkeys(
+            ("surface_start", "surface_reference", "surface_place"), (s.n_vertices, 3)
+        )
+        shapes = {
+            STIFFNESS.name: (1,),
+            FRICTION.name: (1 + len(members),),
+            "surface_slip": (1,),
+            **fields,
+        }
         super().__init__(launcher, sets, shapes)
         self._reach = reach
         self._list = PairList(launcher, s.source.placed(s.n_vertices), reach)
-        self._whole = launcher.zeros(s.n_vertices, 3) if s.nodes_per_cell > 1 else None  # positions, if some depend
+        # Positions, if some depend.
+        self._whole = launcher.zeros(s.n_vertices, 3) if s.nodes_per_cell > 1 else None
         self._members = torch.as_tensor(members, device=launcher.device)
         self._none = torch.zeros(0, device=launcher.device, dtype=torch.int64)
         self._force, self._energy = launcher.zeros(self.n_points, 3), launcher.zeros(self.n_points)
@@ -85,7 +95,8 @@ class SurfaceTerm(Term):
         self._sized = self._list.version
 
     def _expand(self, field: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
-        """Returns a field (B, N, 3) with the values at all vertices of the surface from those at control vertices.
+        """Returns a field (B, N, 3) with the values at all vertices of the surface
+        from those at control vertices.
 
         At other vertices it is zero, or what `out` has there.
         """
@@ -94,7 +105,9 @@ class SurfaceTerm(Term):
         out = torch.zeros_like(field) if out is None else out
         (s,), launcher = self.sets, self.launcher
         inputs = [self._list.vertex_array, s.points, warp_view(field.contiguous(), wp.vec3d)]
-        launcher.run(kernels.interpolate, (launcher.batch, self.n_points), inputs, [warp_view(out, wp.vec3d)])
+        launcher.run(
+            kernels.interpolate, (launcher.batch, self.n_points), inputs, [warp_view(out, wp.vec3d)]
+        )
         return out
 
     @override
@@ -116,9 +129,10 @@ class SurfaceTerm(Term):
             b = int(share.argmin())
             way = (start - before)[b].norm(dim=-1)
             raise InputError(
-                f"an obstacle moves a body through the gap to another one in a step, in environment {b} by up to "
-                f"{1e3 * float(way.max()):.3g} mm, at vertex {int(way.argmax())}: let it move less in a step, or go "
-                "there by several equilibria, one after another."
+                "an obstacle moves a body through the gap to another one in a step, in "
+                f"environment {b} by up to {1e3 * float(way.max()):.3g} mm, at vertex "
+                f"{int(way.argmax())}: let it move less in a step, or go there by several "
+                "equilibria, one after another."
             )
 
     @override
@@ -135,7 +149,8 @@ class SurfaceTerm(Term):
     def _commands(self, positions: Any, active: Any) -> list[Any]:
         """Returns launches of forces and energies at positions."""
         x = self._expand(wp.to_torch(positions), self._whole)
-        if not (self._bounded or self._list.covers(x)):  # By `bounds`, a list holds all pairs up to the next step.
+        if not (self._bounded or self._list.covers(x)):
+            # By `bounds`, a list holds all pairs up to the next step.
             self._list.find(x, torch.zeros_like(x))
         now = (self._list.version, self._steps)
         if active.ptr not in self._recorded or self._recorded[active.ptr][0] != now:
@@ -148,24 +163,37 @@ class SurfaceTerm(Term):
             self._size(pairs.count)
         stiffness = self.view(STIFFNESS.name)
         inputs = [active, pairs.pairs, stiffness, wp.float64(self._reach), positions]
-        pair_out = [warp_view(self._pair_force, nearest_points.Corners), warp_view(self._pair_energy, wp.float64)]
+        pair_out = [
+            warp_view(self._pair_force, nearest_points.Corners),
+            warp_view(self._pair_energy, wp.float64),
+        ]
         sums = [warp_view(self._force, wp.vec3d), warp_view(self._energy, wp.float64)]
         incidence = [warp_view(x, wp.int32) for x in (pairs.start, pairs.incident)]
         size, near = (launcher.batch, self.n_points), warp_view(self._near, wp.int32)
         commands = (
-            [launcher.record(kernels.pair_forces, (pairs.count,), inputs, [*pair_out, near])] if pairs.count else []
+            [launcher.record(kernels.pair_forces, (pairs.count,), inputs, [*pair_out, near])]
+            if pairs.count
+            else []
         )
-        commands.append(launcher.record(kernels.gather, size, [*incidence, *pair_out, self.n_points, 0], sums))
+        commands.append(
+            launcher.record(kernels.gather, size, [*incidence, *pair_out, self.n_points, 0], sums)
+        )
         if (grips := self._grips) is not None:
             inputs = [active, grips.struct, *self._friction(), positions]
-            commands.append(launcher.record(kernels.grip_forces, (grips.count,), inputs, grips.outputs))
+            commands.append(
+                launcher.record(kernels.grip_forces, (grips.count,), inputs, grips.outputs)
+            )
             inputs = [*grips.incidence, *grips.outputs, self.n_points, 1]
             commands.append(launcher.record(kernels.gather, size, inputs, sums))
         return commands
 
     def _friction(self) -> list[Any]:
         """Returns coefficient, slip and reference for the kernels of friction."""
-        names = ((FRICTION.name, wp.float64), ("surface_slip", wp.float64), ("surface_reference", wp.vec3d))
+        names = (
+            (FRICTION.name, wp.float64),
+            ("surface_slip", wp.float64),
+            ("surface_reference", wp.vec3d),
+        )
         return [self.view(name, kind) for name, kind in names]
 
     @override
@@ -183,22 +211,34 @@ class SurfaceTerm(Term):
         return (self._near * active[self._list.environment]).nonzero().ravel()
 
     @override
-    def pair_tangents(self, positions: Any, clamp: bool, active: torch.Tensor) -> PairTangents | None:
+    def pair_tangents(
+        self, positions: Any, clamp: bool, active: torch.Tensor
+    ) -> PairTangents | None:
         launcher, chosen, parts = self.launcher, self._chosen(active), list[PairTangents]()
         if self._whole is not None:
             positions = warp_view(self._expand(wp.to_torch(positions), self._whole), wp.vec3d)
         if len(chosen):
             indices, blocks = chosen.to(torch.int32), self._force.new_zeros(len(chosen), 12, 12)
             stiffness = self.view(STIFFNESS.name)
-            inputs = [warp_view(indices, wp.int32), self._list.pairs, stiffness, wp.float64(self._reach), positions]
+            inputs = [
+                warp_view(indices, wp.int32),
+                self._list.pairs,
+                stiffness,
+                wp.float64(self._reach),
+                positions,
+            ]
             out = [warp_view(blocks, wp.float64)]
             kernel = kernels.pair_springs if clamp else kernels.pair_tangents
             launcher.run(kernel, (len(chosen),), inputs, out)
-            parts.append(PairTangents(self._list.environment[chosen], self._list.nodes[chosen], blocks))
+            parts.append(
+                PairTangents(self._list.environment[chosen], self._list.nodes[chosen], blocks)
+            )
         if (grips := self._grips) is not None:
             blocks = self._force.new_zeros(grips.count, 12, 12)
             inputs = [grips.struct, *self._friction(), positions]
-            launcher.run(kernels.grip_tangents, (grips.count,), inputs, [warp_view(blocks, wp.float64)])
+            launcher.run(
+                kernels.grip_tangents, (grips.count,), inputs, [warp_view(blocks, wp.float64)]
+            )
             used = active.bool()[grips.environment]
             parts.append(PairTangents(grips.environment[used], grips.nodes[used], blocks[used]))
         if not parts:
@@ -215,12 +255,18 @@ class SurfaceTerm(Term):
         return [HostLaunches(lambda: self._bounding(origin, positions, share))]
 
     def _bounding(self, origin: Any, positions: Any, share: Any) -> list[Any]:
-        """Returns the launch that bounds a way, after a search for pairs along it, and limits its length."""
+        """Returns the launch that bounds a way, after a search for pairs along it,
+        and limits its length.
+        """
         launcher, pairs, self._bounded = self.launcher, self._list, True
-        start, end, part = self._expand(wp.to_torch(origin)), self._expand(wp.to_torch(positions)), wp.to_torch(share)
+        start = self._expand(wp.to_torch(origin))
+        end = self._expand(wp.to_torch(positions))
+        part = wp.to_torch(share)
         ways = ((end - start) * launcher.active[:, None, None]).nan_to_num(0.0)
         start = torch.where(launcher.active.bool()[:, None, None], start, end)
-        part.copy_(torch.minimum(part, pairs.longest_way / pairs.lengths(ways).amax(1).clamp_min(_TINY)))
+        part.copy_(
+            torch.minimum(part, pairs.longest_way / pairs.lengths(ways).amax(1).clamp_min(_TINY))
+        )
         way = part[:, None, None] * ways
         if not (pairs.covers(start) and pairs.covers(start + way)):
             pairs.find(start, way)
@@ -238,7 +284,7 @@ class SurfaceTerm(Term):
         return self._energy.new_zeros(1, self.n_points)
 
     def _near_at(self, positions: torch.Tensor) -> torch.Tensor:
-        """Returns the pairs within reach at positions (B, N, 3), whose forces are then those there."""
+        """The pairs within reach at positions (B, N, 3), whose forces are then those there."""
         if not self._list.covers(positions):
             self._list.find(positions, torch.zeros_like(positions))
         active = warp_view(self.launcher.active, wp.int32)
@@ -246,7 +292,9 @@ class SurfaceTerm(Term):
         return self._chosen(self.launcher.active)
 
     def sliding(self, start: torch.Tensor, stiffness: torch.Tensor) -> Sliding | None:
-        """Returns friction for the state at the start of a step, or None without pairs within reach."""
+        """Returns friction for the state at the start of a step,
+        or None without pairs within reach.
+        """
         chosen = self._near_at(start.detach())
         if not len(chosen):
             return None
@@ -256,7 +304,9 @@ class SurfaceTerm(Term):
         return NearPairs.of(self.launcher, self._list, chosen, x)
 
     def _regions(self, chosen: torch.Tensor) -> torch.Tensor:
-        """Returns the number of the coefficient of friction of pairs: that of the first pair of regions they are in."""
+        """Returns the number of the coefficient of friction of pairs:
+        that of the first pair of regions they are in.
+        """
         nodes, out = self._list.nodes[chosen], torch.zeros_like(chosen)
         first = torch.arange(4, device=nodes.device) <= self._list.kind[chosen, None]
         for number, regions in reversed(list(enumerate(self._members, 1))):
@@ -266,9 +316,11 @@ class SurfaceTerm(Term):
         return out
 
     def forces(self, values: Values, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Returns gaps (B, P) [m], normal forces and friction (B, P, 3) on the vertices [N], slides (B, P) [m].
+        """Returns gaps (B, P) [m], normal forces and friction (B, P, 3)
+        on the vertices [N], slides (B, P) [m].
 
-        All are differentiable. Slides are the largest of the pairs of a vertex, negative without one that is pressed.
+        All are differentiable. Slides are the largest of the pairs of a vertex, negative without
+        one that is pressed.
 
         Args:
             values: the values of the step, with their gradients.
@@ -281,12 +333,18 @@ class SurfaceTerm(Term):
         if (slides := self.sliding(start, stiffness)) is not None:
             names = ("surface_reference", FRICTION.name, "surface_slip")
             force = slides.force(x, *(value_of(values, name) for name in names))
-            ways = slides.slide(x, value_of(values, names[0])).square().sum(-1).clamp_min(_TINY).sqrt()
+            ways = (
+                slides.slide(x, value_of(values, names[0])).square().sum(-1).clamp_min(_TINY).sqrt()
+            )
             ways = torch.where(slides.weights == 0.0, -1.0, ways[:, None])
             rows = slides.environment[:, None] * x.shape[1] + slides.nodes
-            slide = slide.ravel().scatter_reduce(0, rows.ravel(), ways.ravel(), "amax").view_as(slide)
+            slide = (
+                slide.ravel().scatter_reduce(0, rows.ravel(), ways.ravel(), "amax").view_as(slide)
+            )
             place = (slides.environment[:, None].expand_as(slides.nodes), slides.nodes)
-            friction = friction.index_put(place, slides.weights[..., None] * force[:, None], accumulate=True)
+            friction = friction.index_put(
+                place, slides.weights[..., None] * force[:, None], accumulate=True
+            )
         if len(chosen := self._near_at(x.detach())):
             differentiable = torch.is_grad_enabled()
             with torch.enable_grad():
@@ -299,7 +357,11 @@ class SurfaceTerm(Term):
             normal = -slope
             entries = near.environment[:, None] * x.shape[1] + near.nodes
             distance = torch.where(near.weights[:, 0] == 0.0, self._reach, near.d[:, :1])
-            gap = gap.ravel().scatter_reduce(0, entries.ravel(), distance.ravel(), "amin").view_as(gap)
+            gap = (
+                gap.ravel()
+                .scatter_reduce(0, entries.ravel(), distance.ravel(), "amin")
+                .view_as(gap)
+            )
         vertices = self._list.vertices
         return gap[:, vertices], normal[:, vertices], friction[:, vertices], slide[:, vertices]
 
@@ -313,7 +375,10 @@ class SurfaceTerm(Term):
             chosen = self._near_at(x)
             environment, nodes = self._list.environment[chosen], self._list.nodes[chosen]
             work = (self._pair_force[chosen] * ways[environment[:, None], nodes]).sum((1, 2))
-            by_stiffness = launcher.zeros(1).index_add_(0, environment, -work[:, None]) / self.values[STIFFNESS.name]
+            by_stiffness = (
+                launcher.zeros(1).index_add_(0, environment, -work[:, None])
+                / self.values[STIFFNESS.name]
+            )
             start, reference, stiffness, friction = leaves = [
                 self.values[name].detach().requires_grad_() for name in names
             ]

@@ -1,4 +1,6 @@
-"""Bodies before a camera, at rest or released: from settings and the files of pictures to `SeenPose`."""
+"""Bodies before a camera, at rest or released: from settings
+and the files of pictures to `SeenPose`.
+"""
 
 import logging
 from collections.abc import Sequence
@@ -53,7 +55,9 @@ _MOVED: Final = 0.05  # m: a tag that can be seen in two ways keeps its place
 
 
 def scene_file(data: PictureData, pose: PoseSettings, run_dir: Path) -> Path:
-    """Returns the path of a pose's camera.json, in the folder of the data or of a simulated laboratory."""
+    """Returns the path of a pose's camera.json, in the folder of the data
+    or of a simulated laboratory.
+    """
     folder = run_dir / "recordings" if data.folder is None else Path(data.folder).expanduser()
     return folder / pose.folder / SCENE
 
@@ -66,7 +70,11 @@ def picture_files(data: PictureData) -> dict[str, str]:
     """
     if data.folder is None:
         return {}
-    paths = [Path(data.folder).expanduser() / lens.file for lens in data.lenses.values() if lens.file is not None]
+    paths = [
+        Path(data.folder).expanduser() / lens.file
+        for lens in data.lenses.values()
+        if lens.file is not None
+    ]
     for pose in data.poses.values():
         scene = scene_of(data, pose, Path())
         beside = [pose.mesh, pose.points, pose.cloud]
@@ -78,7 +86,9 @@ def picture_files(data: PictureData) -> dict[str, str]:
         try:
             result[str(path)] = digest(path)
         except OSError as error:
-            raise DataFileError(f"cannot read {path} ({error.strerror}): check data.folder and data.poses.") from error
+            raise DataFileError(
+                f"cannot read {path} ({error.strerror}): check data.folder and data.poses."
+            ) from error
     return result
 
 
@@ -92,18 +102,23 @@ def scene_of(data: PictureData, pose: PoseSettings, run_dir: Path) -> SceneFile:
     scene = read_scene(scene_file(data, pose, run_dir), pose.cloud is not None)
     if wrong := [number for number in pose.frames or () if number >= len(scene.frames)]:
         raise InputError(
-            f"the frames of {pose.folder} in data.poses name {wrong[0]}, but {scene.path} has {len(scene.frames)}, "
-            "from 0: leave it out."
+            f"the frames of {pose.folder} in data.poses name {wrong[0]}, but {scene.path} has "
+            f"{len(scene.frames)}, from 0: leave it out."
         )
-    frames = tuple(frame for frame in scene.frames if pose.frames is None or frame.number in pose.frames)
+    frames = tuple(
+        frame for frame in scene.frames if pose.frames is None or frame.number in pose.frames
+    )
     if frames and not data.lenses:
-        raise InputError(f"data.lens is not set, and {scene.path} has frames: give the lens of the camera.")
+        raise InputError(
+            f"data.lens is not set, and {scene.path} has frames: give the lens of the camera."
+        )
     for frame in frames:
         if frame.lens not in data.lenses:
             names = listed([lens for lens in data.lenses if lens])
             raise InputError(
-                f"{scene.path}: frame {frame.number} has the lens '{frame.lens}', and data.lens has the names {names}: "
-                "name the lens of a frame, as 'lens', where data.lens has several, and only there."
+                f"{scene.path}: frame {frame.number} has the lens '{frame.lens}', and data.lens "
+                f"has the names {names}: name the lens of a frame, as 'lens', where data.lens "
+                "has several, and only there."
             )
     scene = replace(scene, frames=frames)
     if pose.release is not None:
@@ -134,7 +149,9 @@ def import_pictures(context: StageContext) -> None:
     """
     settings: StageSettings = context.settings
     data = settings.data
-    with atomic_hdf5(context.run_dir / PICTURES, _KIND, {"fingerprint": context.fingerprint}) as file:
+    with atomic_hdf5(
+        context.run_dir / PICTURES, _KIND, {"fingerprint": context.fingerprint}
+    ) as file:
         for name, pose in data.poses.items():
             scene = _without_copies(scene_of(data, pose, context.run_dir), name)
             if pose.release is not None:
@@ -144,18 +161,26 @@ def import_pictures(context: StageContext) -> None:
                 mask, depth = _shown(frame, pose, data)
                 if mask is not None:
                     arrays[f"masks/{frame.number}"] = mask, "1"
-                    if frame.image != frame.depth and not shares:  # A picture with everything but the body dark.
+                    if frame.image != frame.depth and not shares:
+                        # A picture with everything but the body dark.
                         image = read_picture(frame.image)
                         with atomic_path(context.run_dir / "masks" / f"{name}.png") as partial:
-                            Image.fromarray(np.where(mask[..., None], image, image // 4)).save(partial, format="png")
+                            Image.fromarray(np.where(mask[..., None], image, image // 4)).save(
+                                partial, format="png"
+                            )
                     shares.append(100.0 * mask.mean())
                 if depth is not None:
                     arrays[f"depths/{frame.number}"] = depth, "m"
             numbers = [frame.number for frame in scene.frames]
             if pose.points is not None:
-                arrays["tracked"] = _tracked(scene.path.parent / pose.points, name, numbers, data), "px"
+                arrays["tracked"] = (
+                    _tracked(scene.path.parent / pose.points, name, numbers, data),
+                    "px",
+                )
             if pose.cloud is not None:
-                points, normals = read_scan(scene.path.parent / pose.cloud, METRES[data.cloud.units], settings.seed)
+                points, normals = read_scan(
+                    scene.path.parent / pose.cloud, METRES[data.cloud.units], settings.seed
+                )
                 arrays["scan"] = points, "m"
                 arrays |= {} if normals is None else {"scan_normals": (normals, "1")}
                 log.info("import: %s has a scan of %d points", name, len(points))
@@ -163,7 +188,11 @@ def import_pictures(context: StageContext) -> None:
             arrays["frames"] = np.array(numbers), "1"
             for key, (array, unit) in arrays.items():
                 create(file, f"{name}/{key}", array, unit)
-            covers = f", of which the body covers {min(shares):.1f} to {max(shares):.1f} %" if shares else ""
+            covers = (
+                f", of which the body covers {min(shares):.1f} to {max(shares):.1f} %"
+                if shares
+                else ""
+            )
             if numbers:
                 log.info("import: %s has %s%s", name, number_of(len(numbers), "picture"), covers)
 
@@ -181,11 +210,18 @@ def _without_copies(scene: SceneFile, name: str) -> SceneFile:
     return replace(scene, frames=(*different.values(),))
 
 
-def _shown(frame: Frame, pose: PoseSettings, data: PictureData) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
-    """Returns the mask (H, W) of a frame, and its depths (H, W) of the body, zero elsewhere [m]; None without."""
+def _shown(
+    frame: Frame, pose: PoseSettings, data: PictureData
+) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
+    """Returns the mask (H, W) of a frame, and its depths (H, W) of the body, zero elsewhere [m].
+
+    None without.
+    """
     colours, pictured, mask = pose.mask or data.mask, frame.image != frame.depth, None
     deep = frame.depth if pose.depth else None
-    if pose.outline or (deep is not None and (frame.mask is not None or (colours is not None and pictured))):
+    if pose.outline or (
+        deep is not None and (frame.mask is not None or (colours is not None and pictured))
+    ):
         mask = read_mask(frame, colours)
         if frame.mask is not None:
             _check_size(frame.mask, mask, frame.image, read_picture(frame.image))
@@ -196,14 +232,18 @@ def _shown(frame: Frame, pose: PoseSettings, data: PictureData) -> tuple[NDArray
         _check_size(deep, depth, frame.mask or frame.image, mask)
     if pictured:
         _check_size(deep, depth, frame.image, read_picture(frame.image))
-    return mask, np.where(np.isfinite(depth) & (True if mask is None else mask), depth, 0.0).astype(np.float32)
+    return mask, np.where(np.isfinite(depth) & (True if mask is None else mask), depth, 0.0).astype(
+        np.float32
+    )
 
 
 def _tracked(path: Path, name: str, frames: Sequence[int], data: PictureData) -> FloatArray:
     """Returns the pixels (F, M, 2) of the tracked points of a pose in frames by their numbers."""
     tracked = read_tracked(path, [*data.points], data.likelihood, frames)
     if not np.isfinite(tracked).any():
-        raise DataFileError(f"{path}: no point was seen in the frames of data.poses.{name}: leave it out.")
+        raise DataFileError(
+            f"{path}: no point was seen in the frames of data.poses.{name}: leave it out."
+        )
     return tracked
 
 
@@ -211,8 +251,8 @@ def _check_size(path: Path, one: NDArray[Any], picture: Path, other: NDArray[Any
     if one.shape[:2] != other.shape[:2]:
         (height, width), (rows, columns) = one.shape[:2], other.shape[:2]
         raise DataFileError(
-            f"{path} has {width} x {height} pixels, and {picture.name} {columns} x {rows}: bring both to one size, "
-            "depths registered to their picture."
+            f"{path} has {width} x {height} pixels, and {picture.name} {columns} x {rows}: bring "
+            "both to one size, depths registered to their picture."
         )
 
 
@@ -223,24 +263,30 @@ def _cameras(path: Path, frames: Sequence[Frame], data: PictureData) -> FloatArr
     """
     if data.tag is None:
         if missing := [frame.image.name for frame in frames if frame.pose is None]:
-            raise DataFileError(f"{path}: {missing[0]} has no 'world_to_camera': give it, or the tag of data.tag.")
+            raise DataFileError(
+                f"{path}: {missing[0]} has no 'world_to_camera': give it, or the tag of data.tag."
+            )
         poses = [[frame.pose] for frame in frames if frame.pose is not None]
     else:
         tag, lenses = data.tag, read_lenses(data)
         poses = [tag_poses(tag, read_picture(frame.image), lenses[frame.lens]) for frame in frames]
         if hidden := [frame.image for frame, pair in zip(frames, poses, strict=True) if not pair]:
             raise DataFileError(
-                f"{hidden[0]} does not show the tag {tag.number} of {tag.dictionary}: check data.tag, leave the frame "
-                "out, or give its world_to_camera."
+                f"{hidden[0]} does not show the tag {tag.number} of {tag.dictionary}: check "
+                "data.tag, leave the frame out, or give its world_to_camera."
             )
     cameras = np.array([[pair[0], pair[-1]] for pair in poses]).reshape(-1, 2, 4, 4)
     places = cameras[:, 0, :3, 3]
     first = {frame.lens: place for frame, place in reversed([*zip(frames, places, strict=True)])}
-    moved = [float(np.linalg.norm(place - first[f.lens])) for f, place in zip(frames, places, strict=True)]
+    moved = [
+        float(np.linalg.norm(place - first[f.lens]))
+        for f, place in zip(frames, places, strict=True)
+    ]
     if data.stands and max(moved, default=0.0) > _MOVED:
         raise DataFileError(
-            f"{path}: between its frames the camera moves by {100.0 * max(moved):.0f} cm against the origin of the "
-            "mesh: set data.stands=false if it does, or name several in data.lens; world_to_camera is in m."
+            f"{path}: between its frames the camera moves by {100.0 * max(moved):.0f} cm against "
+            "the origin of the mesh: set data.stands=false if it does, or name several in "
+            "data.lens; world_to_camera is in m."
         )
     return cameras
 
@@ -260,11 +306,16 @@ class SeenPoses:
     def __init__(self, settings: StageSettings, run_dir: Path) -> None:
         self.settings, self.data, self.run_dir = settings, settings.data, run_dir
         self.lenses, self._poses = read_lenses(self.data), dict[str, SeenPose]()
-        self._loaded: dict[str, dict[str, NDArray[Any]]] = {}  # arrays of each pose in pictures.h5, by name
+        # Arrays of each pose in pictures.h5, by name.
+        self._loaded: dict[str, dict[str, NDArray[Any]]] = {}
         with read_hdf5(run_dir / PICTURES, _KIND) as file:
             for name in self.data.poses:
                 keys = list[str]()
-                file[name].visititems(lambda key, item, keys=keys: keys.append(key) if hasattr(item, "shape") else None)
+                file[name].visititems(
+                    lambda key, item, keys=keys: (
+                        keys.append(key) if hasattr(item, "shape") else None
+                    )
+                )
                 self._loaded[name] = {key: read_array(file[name], key) for key in keys}
 
     def picture(self, name: str, number: int) -> NDArray[np.uint8]:
@@ -278,12 +329,20 @@ class SeenPoses:
     def _frames(self, name: str) -> list[Frame]:
         """The frames of a pose that are used."""
         used = self._loaded[name]["frames"]
-        return [f for f in scene_of(self.data, self.data.poses[name], self.run_dir).frames if f.number in used]
+        return [
+            f
+            for f in scene_of(self.data, self.data.poses[name], self.run_dir).frames
+            if f.number in used
+        ]
 
     def cameras_of(self, name: str, lens: str) -> list[torch.Tensor]:
-        """Returns the different cameras (4, 4) of a pose's frames by a lens, from which a standing one is chosen."""
+        """Returns the different cameras (4, 4) of a pose's frames by a lens,
+        from which a standing one is chosen.
+        """
         different, mine = list[torch.Tensor](), [frame.lens == lens for frame in self._frames(name)]
-        for camera in torch.as_tensor(self._loaded[name]["world_to_camera"][mine].reshape(-1, 4, 4)):
+        for camera in torch.as_tensor(
+            self._loaded[name]["world_to_camera"][mine].reshape(-1, 4, 4)
+        ):
             if all((camera - other).abs().max() > _ALIKE for other in different):
                 different.append(camera)
         return different
@@ -295,7 +354,10 @@ class SeenPoses:
         return common.changed(**{**common.values, **parameters})
 
     def pose(self, name: str) -> SeenPose:
-        """Returns a pose by its name, with a camera for each frame; of a tag, the one that fits better."""
+        """Returns a pose by its name, with a camera for each frame.
+
+        Of a tag, the one that fits better.
+        """
         if name in self._poses:
             return self._poses[name]
         settings, wanted, loaded = self.settings, self.data.poses[name], self._loaded[name]
@@ -304,15 +366,21 @@ class SeenPoses:
         material = self.material(name)
         if wanted.gravity is not None:
             settings = settings.model_copy(update={"gravity": wanted.gravity})
-        simulator = build_simulator(settings, material, Body(mesh, fixed=fixed, **dict(settings.physics)))
+        simulator = build_simulator(
+            settings, material, Body(mesh, fixed=fixed, **dict(settings.physics))
+        )
         points = None
         if wanted.points is not None:
             points = bind_markers(mesh, [*self.data.points.values()], [*self.data.points])
         centre = torch.as_tensor(mesh.vertices[fixed].mean(0))
-        scene, photos, surface = scene_of(self.data, wanted, self.run_dir), list[Photo](), ClosedSurface.of(mesh)
+        scene = scene_of(self.data, wanted, self.run_dir)
+        photos = list[Photo]()
+        surface = ClosedSurface.of(mesh)
         for number, frame in enumerate(self._frames(name)):
             camera = PlacedCamera(
-                self.lenses[frame.lens], torch.as_tensor(loaded["world_to_camera"][number, 0]), centre
+                self.lenses[frame.lens],
+                torch.as_tensor(loaded["world_to_camera"][number, 0]),
+                centre,
             )
             outline = Outline.of_mask(loaded[f"masks/{frame.number}"]) if wanted.outline else None
             tracked = loaded["tracked"][number] if "tracked" in loaded else None
@@ -325,14 +393,20 @@ class SeenPoses:
         if (scan := loaded.get("scan")) is not None:
             camera = PlacedCamera(None, torch.as_tensor(scene.scan_pose), centre)
             outside = scan + loaded["scan_normals"] if "scan_normals" in loaded else None
-            cloud = self._cloud(scene.path.parent / str(wanted.cloud), Cloud(scan, outside), camera, mesh, fixed)
+            cloud = self._cloud(
+                scene.path.parent / str(wanted.cloud), Cloud(scan, outside), camera, mesh, fixed
+            )
             photos.append(Photo(f"{wanted.folder}/{wanted.cloud}", camera, cloud=cloud))
         release, material_name = released_force(name, wanted, mesh), wanted.material or ""
-        pose = SeenPose(name, simulator, surface, clamps, tuple(photos), material_name, points, release=release)
+        pose = SeenPose(
+            name, simulator, surface, clamps, tuple(photos), material_name, points, release=release
+        )
         self._poses[name] = pose
         return pose
 
-    def _cloud(self, path: Path, cloud: Cloud, camera: PlacedCamera, mesh: Mesh, clamped: IntArray) -> Cloud:
+    def _cloud(
+        self, path: Path, cloud: Cloud, camera: PlacedCamera, mesh: Mesh, clamped: IntArray
+    ) -> Cloud:
         """The points that may be of a body, as many as configured."""
         wanted = self.data.cloud
         cloud = replace(cloud, noise=wanted.noise, reach=wanted.reach)
@@ -350,8 +424,8 @@ class SeenPoses:
         corners = len(mesh.vertices)
         if wrong := [clamp for clamp in scene.clamps if clamp.min() < 0 or clamp.max() >= corners]:
             raise DataFileError(
-                f"{scene.path}: 'fixed' has vertices from {wrong[0].min()} to {wrong[0].max()}, but the mesh has those "
-                f"from 0 to {corners - 1}."
+                f"{scene.path}: 'fixed' has vertices from {wrong[0].min()} to {wrong[0].max()}, "
+                f"but the mesh has those from 0 to {corners - 1}."
             )
         if pose.mesh is not None and self.data.order == 2:
             mesh = quadratic(mesh)
@@ -381,6 +455,8 @@ def read_lenses(data: PictureData) -> dict[str, Lens]:
     """
     folder = Path(data.folder or ".").expanduser()
     return {
-        name: Lens(torch.tensor(one.matrix, dtype=torch.float64)) if one.file is None else Lens.read(folder / one.file)
+        name: Lens(torch.tensor(one.matrix, dtype=torch.float64))
+        if one.file is None
+        else Lens.read(folder / one.file)
         for name, one in data.lenses.items()
     }

@@ -1,8 +1,9 @@
 """Stage: imports recordings as markers in the frame of the body and inputs, from time zero on.
 
-Time zero is the release of a held body, or the first frame of a body that rests until its inputs begin. Released bodies
-keep the times of their frames, at which simulations are interpolated, so that the frame rate need not match the time
-step. Driven bodies are resampled to the time steps, during which inputs are constant.
+Time zero is the release of a held body, or the first frame of a body that rests until its inputs
+begin. Released bodies keep the times of their frames, at which simulations are interpolated, so
+that the frame rate need not match the time step. Driven bodies are resampled to the time steps,
+during which inputs are constant.
 """
 
 import logging
@@ -39,18 +40,23 @@ def import_recordings(context: StageContext) -> None:
     """Writes dataset.h5, quality.json and registration.json.
 
     Raises:
-        DataFileError: a recording cannot be read or used; the message names the file and the marker.
+        DataFileError: a recording cannot be read or used; the message names the file and the
+            marker.
         InputError: a configured value is invalid.
     """
     recorded = RegisteredTrials(context.settings, context.run_dir)
     _check_input_unit(recorded)
-    names, sessions = [trial.name for trial in recorded.trials], [trial.session for trial in recorded.trials]
-    if text := sessions_text({n: r.rate for n, r in zip(names, recorded.measured, strict=True)}, sessions):
+    names = [trial.name for trial in recorded.trials]
+    sessions = [trial.session for trial in recorded.trials]
+    if text := sessions_text(
+        {n: r.rate for n, r in zip(names, recorded.measured, strict=True)}, sessions
+    ):
         log.warning("import: %s", text)
     training = names if context.settings.learned is None else context.settings.learned
     offsets = _offsets(recorded)
     bound = _bound(recorded, offsets, training)
-    bound_markers(recorded.markers, recorded.body.mesh, bound, recorded.tracked)  # Refuses a far marker.
+    # Refuses a far marker.
+    bound_markers(recorded.markers, recorded.body.mesh, bound, recorded.tracked)
     mountings = _mountings(recorded, bound, offsets, training)
     verticals, gravity = _verticals(recorded)
     shifts = _shifts(recorded, bound, offsets)
@@ -58,7 +64,10 @@ def import_recordings(context: StageContext) -> None:
     driven = [row for row, trial in enumerate(recorded.trials) if not trial.is_released]
     hidden = {*driven} - {*(evenly(driven, _SHOWN) if driven else [])}
     shown = {name: row for row, name in enumerate(names) if row not in hidden}
-    write_json(context.run_dir / QUALITY, {name: asdict(_quality(recorded, row)) for name, row in shown.items()})
+    write_json(
+        context.run_dir / QUALITY,
+        {name: asdict(_quality(recorded, row)) for name, row in shown.items()},
+    )
     registrations = {name: _registration(recorded, row, shifts[row]) for name, row in shown.items()}
     for name, row in shown.items():
         if mountings[name]:
@@ -69,7 +78,7 @@ def import_recordings(context: StageContext) -> None:
 
 
 def import_scaled(context: StageContext) -> None:
-    """Writes dataset_scaled.h5 with the trials at scaled inputs, and the marker places of dataset.h5.
+    """Writes dataset_scaled.h5 with trials at scaled inputs, and the marker places of dataset.h5.
 
     Raises:
         DataFileError: a recording cannot be read or used.
@@ -90,14 +99,17 @@ def _check_input_unit(recorded: RegisteredTrials) -> None:
     highest = max(float(np.abs(inputs).max()) for inputs in driven)
     if highest < NO_INPUT * limit:
         raise DataFileError(
-            f"the {drive.quantity.plural} of all {len(driven)} recordings stay below {highest:.3g} "
-            f"{drive.quantity.unit}, and data.input_limit is {limit:.3g} {drive.quantity.unit}: give their unit in "
-            "the files (actuation_units, or the header of the column), or set the limit to the robot's maximum."
+            f"the {drive.quantity.plural} of all {len(driven)} recordings stay below "
+            f"{highest:.3g} {drive.quantity.unit}, and data.input_limit is {limit:.3g} "
+            f"{drive.quantity.unit}: give their unit in the files (actuation_units, or the "
+            "header of the column), or set the limit to the robot's maximum."
         )
 
 
 def sessions_text(rates: Mapping[str, float], sessions: Sequence[str | None]) -> str:
-    """Returns a sentence on recordings that look like several sessions; empty if they do not, or if one is named.
+    """Returns a sentence on recordings that look like several sessions.
+
+    Empty if they do not, or if one is named.
 
     Args:
         rates: frames a second of the recordings, by trial.
@@ -110,18 +122,22 @@ def sessions_text(rates: Mapping[str, float], sessions: Sequence[str | None]) ->
         return ""
     listed = "; ".join(f"{rate} Hz: {', '.join(names)}" for rate, names in sorted(kinds.items()))
     return (
-        f"the recordings have different frame rates, as those of different sessions ({listed}): name them with "
-        "data.trials.NAME.session, so that markers may have other places in each."
+        f"the recordings have different frame rates, as those of different sessions ({listed}): "
+        "name them with data.trials.NAME.session, so that markers may have other places in each."
     )
 
 
 def _offsets(recorded: RegisteredTrials) -> FloatArray:
-    """(R, M, 3) observed minus expected places of tracked markers in the frame of the body [m], NaN if not seen.
+    """(R, M, 3) observed minus expected places of tracked markers
+    in the frame of the body [m], NaN if not seen.
 
-    Those of rigid bodies are turned back with their part, so that they are places on the undeformed body.
+    Those of rigid bodies are turned back with their part, so that they are places on the undeformed
+    body.
     """
     offsets = np.full((len(recorded.trials), *recorded.nominal.shape), np.nan)
-    for offset, trial, registration in zip(offsets, recorded.trials, recorded.registrations, strict=True):
+    for offset, trial, registration in zip(
+        offsets, recorded.trials, recorded.registrations, strict=True
+    ):
         has = trial.tracked(recorded.tracked)
         places = recorded.view(trial).of_arrays(registration.positions[: len(has)])
         offset[has] = places - recorded.expected(trial)[: len(has)]
@@ -130,7 +146,9 @@ def _offsets(recorded: RegisteredTrials) -> FloatArray:
 
 
 def _bound(recorded: RegisteredTrials, offsets: FloatArray, training: Container[str]) -> FloatArray:
-    """(M, 3) places of markers: nominal ones with their mean offsets; of rigid bodies, as their poses at rest [m].
+    """(M, 3) places of markers: nominal ones with their mean offsets.
+
+    Of rigid bodies, as their poses at rest [m].
 
     Test trials are used only for markers that no training trial has.
 
@@ -141,12 +159,15 @@ def _bound(recorded: RegisteredTrials, offsets: FloatArray, training: Container[
     learned = np.array([trial.name in training for trial in recorded.trials])
     for marker, seen in enumerate(np.isfinite(offsets).all(axis=2).T & shows):
         if seen.any():
-            bound[marker] += offsets[seen & learned if (seen & learned).any() else seen, marker].mean(axis=0)
+            bound[marker] += offsets[
+                seen & learned if (seen & learned).any() else seen, marker
+            ].mean(axis=0)
     for name, corners in corners_of(recorded.tracked).items():
         if not any(shows[row] and trial.has(name) for row, trial in enumerate(recorded.trials)):
             raise InputError(
-                f"markers.rigid_bodies.{name}: its mounting on the body is unknown, as no trial shows it while the "
-                "body is undeformed or at rest under its own weight alone: add such a trial, as a pose or a motion."
+                f"markers.rigid_bodies.{name}: its mounting on the body is unknown, as no trial "
+                "shows it while the body is undeformed or at rest under its own weight alone: "
+                "add such a trial, as a pose or a motion."
             )
         nominal = recorded.nominal[corners]
         bound[corners] = motion_between(nominal, bound[corners]).apply(nominal)
@@ -156,7 +177,8 @@ def _bound(recorded: RegisteredTrials, offsets: FloatArray, training: Container[
 def _mountings(
     recorded: RegisteredTrials, bound: FloatArray, offsets: FloatArray, training: Container[str]
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """Distance [mm] and angle [degrees] of the mountings of rigid bodies in each trial from those of all, by trial.
+    """Distance [mm] and angle [degrees] of the mountings of rigid bodies
+    in each trial from those of all, by trial.
 
     Raises:
         InputError: a rigid body was remounted between two trials.
@@ -164,8 +186,13 @@ def _mountings(
     trials = recorded.trials
     mountings: dict[str, dict[str, dict[str, float]]] = {trial.name: {} for trial in trials}
     for name, corners in corners_of(recorded.tracked).items():
-        shown = [row for row, trial in enumerate(trials) if recorded.shows_places[row] and trial.has(name)]
-        nominal, places = recorded.nominal[corners], recorded.nominal[corners] + offsets[shown][:, corners]
+        shown = [
+            row
+            for row, trial in enumerate(trials)
+            if recorded.shows_places[row] and trial.has(name)
+        ]
+        nominal = recorded.nominal[corners]
+        places = recorded.nominal[corners] + offsets[shown][:, corners]
         away = _MILLI * np.linalg.norm(places.mean(axis=1) - bound[corners].mean(axis=0), axis=-1)
         turned = np.degrees(angles(bound[corners], places))
         first = next((at for at, row in enumerate(shown) if trials[row].name in training), 0)
@@ -175,15 +202,16 @@ def _mountings(
             source, other = (recorded.measured[shown[at]].source for at in (worst, first))
             moved = _MILLI * np.linalg.norm((places[worst] - places[first]).mean(axis=0))
             raise InputError(
-                f"{source}: {name!r} is {moved:.1f} mm and {np.degrees(angles(places[first], places[worst])):.1f} "
-                f"degrees from its mounting in {other.name}: where it was remounted, give it another name in "
+                f"{source}: {name!r} is {moved:.1f} mm and "
+                f"{np.degrees(angles(places[first], places[worst])):.1f} degrees from its "
+                f"mounting in {other.name}: where it was remounted, give it another name in "
                 "data.trials.NAME.labels and in markers.rigid_bodies."
             )
         for row, distance, angle in zip(shown, away, turned, strict=True):
             mountings[trials[row].name][name] = {"distance_mm": distance, "angle_deg": angle}
         log.info(
-            "import: %s is mounted %.1f mm from the centre of what carries it, turned by %.1f degrees; the trials "
-            "differ from this by up to %.2f mm and %.2f degrees",
+            "import: %s is mounted %.1f mm from the centre of what carries it, turned by %.1f "
+            "degrees; the trials differ from this by up to %.2f mm and %.2f degrees",
             *(name, _MILLI * np.linalg.norm(np.mean(bound[corners] - nominal, axis=0))),
             *(np.degrees(angles(nominal, bound[corners])), away.max(), turned.max()),
         )
@@ -191,7 +219,10 @@ def _mountings(
 
 
 def _shifts(recorded: RegisteredTrials, bound: FloatArray, offsets: FloatArray) -> FloatArray:
-    """(R, M, 3) shifts that move the markers of each trial to their places [m]; zero if alignment is shared."""
+    """(R, M, 3) shifts that move the markers of each trial to their places [m].
+
+    Zero if alignment is shared.
+    """
     if recorded.data.alignment == "shared":
         return np.zeros_like(offsets)
     turned = np.stack([recorded.turned(trial) for trial in recorded.trials])
@@ -200,10 +231,11 @@ def _shifts(recorded: RegisteredTrials, bound: FloatArray, offsets: FloatArray) 
 
 
 def _verticals(recorded: RegisteredTrials) -> tuple[FloatArray | None, FloatArray]:
-    """Returns the (R, 3) vertical of each recording in the frame of the body, and (3,) gravity there [m/s^2].
+    """Returns the (R, 3) vertical of each recording in the frame of the body,
+    and (3,) gravity there [m/s^2].
 
-    Gravity has the mean of their directions, and the configured strength. Where the vertical is unknown, gravity is the
-    configured one.
+    Gravity has the mean of their directions, and the configured strength. Where the vertical is
+    unknown, gravity is the configured one.
 
     Raises:
         InputError: a vertical is far from that of the configured gravity.
@@ -211,14 +243,17 @@ def _verticals(recorded: RegisteredTrials) -> tuple[FloatArray | None, FloatArra
     up, configured = recorded.data.up, np.asarray(recorded.settings.gravity, dtype=np.float64)
     if up is None:
         return None, configured
-    verticals = np.stack([fit.transform.rotation @ unit_vector(up) for fit in recorded.registrations])
+    verticals = np.stack(
+        [fit.transform.rotation @ unit_vector(up) for fit in recorded.registrations]
+    )
     for recording, measured in zip(recorded.measured, verticals, strict=True):
         if configured.any() and _angle(measured, -configured) > _LARGEST_LEAN:
             down = ", ".join(f"{-x:.2f}" for x in measured)
             raise InputError(
                 f"{recording.source}: with data.up {up}, gravity points along ({down}) in the "
-                f"frame of the body, {_angle(measured, -configured):.0f} degrees from the configured one: set data.up "
-                "to the vertical of the recordings, or gravity to its direction in the frame of markers and mesh."
+                f"frame of the body, {_angle(measured, -configured):.0f} degrees from the "
+                "configured one: set data.up to the vertical of the recordings, or gravity to "
+                "its direction in the frame of markers and mesh."
             )
     mean = verticals.mean(axis=0)
     return verticals, -np.linalg.norm(configured) * mean / np.linalg.norm(mean)
@@ -229,27 +264,46 @@ def _angle(a: FloatArray, b: FloatArray) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
-def _dataset(recorded: RegisteredTrials, bound: FloatArray, shifts: FloatArray, gravity: FloatArray) -> Trials:
+def _dataset(
+    recorded: RegisteredTrials, bound: FloatArray, shifts: FloatArray, gravity: FloatArray
+) -> Trials:
     """Makes the dataset in the frame of the body; trials that end early are padded."""
     trials, settings = recorded.trials, recorded.settings
     begins = ["released" if trial.is_released else trial.begins for trial in trials]
     begins = [UNDER_INPUTS if word == SLACK else word for word in begins]
-    resting = [len(r.positions) for r, word in zip(recorded.moving, begins, strict=True) if word in RESTING]
+    resting = [
+        len(r.positions) for r, word in zip(recorded.moving, begins, strict=True) if word in RESTING
+    ]
     steps = settings.data.steps
     if resting:
         steps = steps or max(*resting, 2) - 1
-    times, observed, smoothed, held = _series(recorded, bound, shifts, steps, steps + 1 if resting and steps else 1)
-    at_steps = settings.time_step * np.arange(round(np.ceil(times.max() / settings.time_step - 1e-6)) + 1)
-    moved, driven, drive = any(r.base is not None for r in recorded.moving), dict[str, Any](), recorded.drive
+    times, observed, smoothed, held = _series(
+        recorded, bound, shifts, steps, steps + 1 if resting and steps else 1
+    )
+    at_steps = settings.time_step * np.arange(
+        round(np.ceil(times.max() / settings.time_step - 1e-6)) + 1
+    )
+    moved = any(r.base is not None for r in recorded.moving)
+    driven = dict[str, Any]()
+    drive = recorded.drive
     if drive is not None:
         name = drive.quantity.name
         inputs = _inputs(recorded, steps or 1, len(drive.parts))
-        driven = {"inputs": {name: inputs}, "channels": {name: drive.parts}, "units": {name: drive.quantity.unit}}
+        driven = {
+            "inputs": {name: inputs},
+            "channels": {name: drive.parts},
+            "units": {name: drive.quantity.unit},
+        }
         if UNDER_INPUTS in begins:
             first = [r.actuation[0] for r in recorded.moving if r.actuation is not None]
             driven["resting"] = {name: np.array(first)}
     obstacles = {
-        name: _motion(recorded, f"the obstacle {name!r}", [r.obstacles.get(name) for r in recorded.moving], at_steps)
+        name: _motion(
+            recorded,
+            f"the obstacle {name!r}",
+            [r.obstacles.get(name) for r in recorded.moving],
+            at_steps,
+        )
         for name in dict.fromkeys(name for r in recorded.moving for name in r.obstacles)
     }
     sessions = tuple(trial.session or "" for trial in trials)
@@ -265,7 +319,9 @@ def _dataset(recorded: RegisteredTrials, bound: FloatArray, shifts: FloatArray, 
         time_step=settings.time_step,
         bound=bound,
         smoothed=smoothed if recorded.data.cutoff is not None or {*begins} <= {*RESTING} else None,
-        base=_motion(recorded, "the base", [r.base for r in recorded.moving], at_steps) if moved else None,
+        base=_motion(recorded, "the base", [r.base for r in recorded.moving], at_steps)
+        if moved
+        else None,
         obstacles=obstacles,
         sessions=sessions if any(sessions) else (),
         loads=_loads(recorded, times.shape[1]),
@@ -290,7 +346,8 @@ def _loads(recorded: RegisteredTrials, frames: int) -> dict[str, FloatArray]:
             if not np.isfinite(found[name][..., AXES.index(axis)]).any():
                 raise DataFileError(
                     f"sensors.{name} measures {axis}, but no recording has it: name its column "
-                    f"'{name}.{axis} [{UNITS[axis]}]' (docs/recordings.md), or take it out of sensors.{name}.axes."
+                    f"'{name}.{axis} [{UNITS[axis]}]' (docs/recordings.md), or take it out of "
+                    f"sensors.{name}.axes."
                 )
     return found
 
@@ -298,7 +355,8 @@ def _loads(recorded: RegisteredTrials, frames: int) -> dict[str, FloatArray]:
 def _series(
     recorded: RegisteredTrials, bound: FloatArray, shifts: FloatArray, steps: int | None, least: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Returns times (R, T) [s], positions and smoothed ones (R, T, M, 3), and those before time zero (R, M, 3) [m].
+    """Returns times (R, T) [s], positions and smoothed ones (R, T, M, 3),
+    and those before time zero (R, M, 3) [m].
 
     Args:
         recorded: the trials.
@@ -308,7 +366,10 @@ def _series(
         least: least number T of frames.
     """
     trials, cutoff, step = recorded.trials, recorded.data.cutoff, recorded.settings.time_step
-    lengths = [len(moving.positions) if t.is_released else 1 for t, moving in zip(trials, recorded.moving, strict=True)]
+    lengths = [
+        len(moving.positions) if t.is_released else 1
+        for t, moving in zip(trials, recorded.moving, strict=True)
+    ]
     frames = max(*lengths, least)
     shape = (len(trials), frames, len(recorded.tracked), 3)
     observed, smoothed = np.full(shape, np.nan), np.full(shape, np.nan)
@@ -319,7 +380,9 @@ def _series(
         slow = moving if cutoff is None or len(seen) == 1 else smooth(moving, cutoff)
         has = trial.tracked(recorded.tracked)
         for series, positions in ((observed, seen), (smoothed, slow.positions[:limit])):
-            series[row, : len(seen), has] = recorded.to_body(row, positions, shifts[row, has]).swapaxes(0, 1)
+            series[row, : len(seen), has] = recorded.to_body(
+                row, positions, shifts[row, has]
+            ).swapaxes(0, 1)
         held[row, has] = recorded.to_body(row, recorded.rests[row][: len(has)], shifts[row, has])
         if trial.is_released:
             times[row] = np.pad(moving.time, (0, frames - len(seen)), mode="edge")
@@ -327,12 +390,16 @@ def _series(
             times[row] = np.minimum(np.arange(frames), steps or 0) * step
             held[row] = np.where(np.isfinite(observed[row, 0]), observed[row, 0], held[row])
         else:
-            held[row, has] = bound[has]  # The displacement of a static pose counts from the undeformed body.
+            # The displacement of a static pose counts from the undeformed body.
+            held[row, has] = bound[has]
     return times, observed, smoothed, held
 
 
 def _inputs(recorded: RegisteredTrials, steps: int, parts: int) -> FloatArray:
-    """(R, K, C) inputs of the trials during the steps; the last ones are repeated after the end of a trial."""
+    """(R, K, C) inputs of the trials during the steps.
+
+    The last ones are repeated after the end of a trial.
+    """
     inputs, short = np.zeros((len(recorded.trials), steps, parts)), list[str]()
     for row, moving in enumerate(recorded.moving):
         if moving.actuation is None:
@@ -343,7 +410,8 @@ def _inputs(recorded: RegisteredTrials, steps: int, parts: int) -> FloatArray:
             short.append(f"{moving.source.name}: {len(series)}")
     if short and recorded.data.steps is not None:
         log.warning(
-            "import: recordings are shorter than the %d steps of data.steps (%s); missing frames are ignored.",
+            "import: recordings are shorter than the %d steps of data.steps (%s); "
+            "missing frames are ignored.",
             *(steps, ", ".join(short)),
         )
     return inputs
@@ -352,9 +420,13 @@ def _inputs(recorded: RegisteredTrials, steps: int, parts: int) -> FloatArray:
 def _motion(
     recorded: RegisteredTrials, what: str, poses: Sequence[FloatArray | None], at_steps: FloatArray
 ) -> FloatArray:
-    """(R, K + 1, 6) motion of the base or of an obstacle at the steps (K + 1,), from the poses at the frames."""
+    """(R, K + 1, 6) motion of the base or of an obstacle at the steps (K + 1,),
+    from the poses at the frames.
+    """
     motion, points = np.zeros((len(poses), len(at_steps), 6)), recorded.body.mesh.vertices
-    for row, (trial, moving, at_frames) in enumerate(zip(recorded.trials, recorded.moving, poses, strict=True)):
+    for row, (trial, moving, at_frames) in enumerate(
+        zip(recorded.trials, recorded.moving, poses, strict=True)
+    ):
         if at_frames is not None:
             zero = 0.0 if trial.is_released else moving.start  # of the simulation
             motion[row] = at_times(at_frames, moving.time - zero, at_steps)
@@ -379,9 +451,12 @@ def _quality(recorded: RegisteredTrials, row: int) -> Quality:
 
 
 def _registration(recorded: RegisteredTrials, row: int, shifts: FloatArray) -> RegistrationSummary:
-    """Content of registration.json on a trial, in millimetres but for positions in the frame of the body [m]."""
+    """Content of registration.json on a trial, in millimetres
+    but for positions in the frame of the body [m].
+    """
     markers, fit, tracked = recorded.markers, recorded.registrations[row], recorded.tracked
-    # Places of the tracked markers of a loaded body are not known, and do not concern the registration.
+    # Places of the tracked markers of a loaded body are not known, and do not concern the
+    # registration.
     known = [*markers.reference, *(markers.tracked if recorded.shows_places[row] else [])]
     rows = [number for number, label in enumerate(fit.names) if label in known]
     names, has = [fit.names[number] for number in rows], recorded.trials[row].tracked(tracked)
@@ -390,5 +465,7 @@ def _registration(recorded: RegisteredTrials, row: int, shifts: FloatArray) -> R
         "rms_mm": _MILLI * fit.rms,
         "residual_mm": dict(zip(names, _MILLI * fit.residual[rows], strict=True)),
         "outliers": list(fit.outliers),
-        "shift_mm": {tracked[n]: (-_MILLI * shifts[n]).tolist() for n in has if tracked[n] in markers.tracked},
+        "shift_mm": {
+            tracked[n]: (-_MILLI * shifts[n]).tolist() for n in has if tracked[n] in markers.tracked
+        },
     }

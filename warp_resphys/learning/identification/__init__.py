@@ -1,1 +1,3 @@
-"""Identification of the parameters of a simulator and of the law of its material, with their uncertainty."""
+"""Identification of the parameters of a simulator and of the law of its material,
+with their uncertainty.
+"""

@@ -1,8 +1,9 @@
-"""System identification: the physical parameters with which a simulator comes closest to observed motions.
+"""System identification: the physical parameters with
+which a simulator comes closest to observed motions.
 
-A parameter may have a value for each trial or session, near the mean of a prior. Those of a test trial, and of a new
-session, follow from their first frames. Marker places on the body, the frame of the recordings and delays of inputs are
-fitted with the parameters (`nuisances`).
+A parameter may have a value for each trial or session, near the mean of a prior. Those of a test
+trial, and of a new session, follow from their first frames. Marker places on the body, the frame of
+the recordings and delays of inputs are fitted with the parameters (`nuisances`).
 """
 
 import logging
@@ -63,55 +64,89 @@ def identify(
 ) -> Identification:
     """Finds the parameters with which a simulator comes closest to observed motions.
 
-    A parameter with ``per`` part has a value for each chamber, tendon or muscle, such as ``pressure_factor_1``; with
-    ``per`` trial or session it has one for each, near the mean of its prior; with ``("part", "session")``, each part in
-    each session. Values of held-out trials whose motion inputs begin, and of a session of which all trials are held
-    out, follow from their first frames (`ReleaseSettings.window`), which then count in no error.
+    A parameter with ``per`` part has a value for each chamber, tendon or muscle, such as
+    ``pressure_factor_1``; with ``per`` trial or session it has one for each, near the mean of its
+    prior; with ``("part", "session")``, each part in each session. Values of held-out trials whose
+    motion inputs begin, and of a session of which all trials are held out, follow from their first
+    frames (`ReleaseSettings.window`), which then count in no error.
 
     Args:
         simulator: gives all other parameters.
         motions: observed states or markers.
-        parameters: range of every parameter to identify, by a name of `Replay.parameter_names`, in its unit. A pair of
-            positive numbers is searched on a logarithmic scale.
-        first_guess: start of the search, which is brought into the ranges; the simulator's own values where left out.
+        parameters: range of every parameter to identify, by a name of `Replay.parameter_names`, in
+            its unit. A pair of positive numbers is searched on a logarithmic scale.
+        first_guess: start of the search, which is brought into the ranges; the simulator's own
+            values where left out.
         names: trials to identify from; all by default.
-        held_out: other trials, whose own values, and those of their session, follow from their first frames.
-        accuracy: of marker places and the recording's frame, which are identified; None: they are exact.
-        seconds: duration of each motion that is used [s]; None for the part that `motions` learns from.
+        held_out: other trials, whose own values, and those of their session, follow from their
+            first frames.
+        accuracy: of marker places and the recording's frame, which are identified; None: they are
+            exact.
+        seconds: duration of each motion that is used [s]; None for the part that `motions` learns
+            from.
         starts: number of searches; those after the first start at the best of random candidates.
         candidates: number of these; four times the starts by default.
         max_evaluations: of the loss and its gradient, for each start.
         tolerance: relative decrease of the loss below which a search ends.
         seed: of the random candidates.
-        kept: file of the finished searches, from which an interrupted identification goes on; it is not used if
-            anything that they depend on has changed. None: nothing is kept.
+        kept: file of the finished searches, from which an interrupted identification goes on; it is
+            not used if anything that they depend on has changed. None: nothing is kept.
 
     Raises:
-        InputError: an unknown parameter, an empty range, a number out of range, a motion in which nothing moves, or
-            first frames without a marker.
+        InputError: an unknown parameter, an empty range, a number out of range, a motion in which
+            nothing moves, or first frames without a marker.
         ConvergenceError: the simulation fails at every start.
     """
     trials = motions.trials.chosen(names)
     motions.trials.rows(held_out)
     wanted, identifiable = ranges_of(parameters), identifiable_parameters(simulator)
-    check_ranges(simulator, wanted, identifiable, {name: motions.trials.session(name) for name in (*trials, *held_out)})
+    check_ranges(
+        simulator,
+        wanted,
+        identifiable,
+        {name: motions.trials.session(name) for name in (*trials, *held_out)},
+    )
     ranges = by_part(simulator, wanted, wanted)
     shown_first = _shown_first(motions, trials, held_out, ranges)
     with naming("first_guess: "):
         check_names(first_guess or {}, identifiable)
     many = 4 * starts if candidates is None else candidates
-    numbers = {"starts": starts, "candidates": many, "max_evaluations": max_evaluations, "tolerance": tolerance}
-    parse(IdentifySettings, {**numbers, "seconds": seconds, "first_guess": {**(first_guess or {})}}, "identify")
-    bounds, replays = _bounds_of_owners(ranges, motions.trials, trials), motions.replays(simulator, trials)
+    numbers = {
+        "starts": starts,
+        "candidates": many,
+        "max_evaluations": max_evaluations,
+        "tolerance": tolerance,
+    }
+    parse(
+        IdentifySettings,
+        {**numbers, "seconds": seconds, "first_guess": {**(first_guess or {})}},
+        "identify",
+    )
+    bounds = _bounds_of_owners(ranges, motions.trials, trials)
+    replays = motions.replays(simulator, trials)
     known = {**configured_parameters(simulator, [split_name(name)[0] for name in bounds])}
     known |= by_part(simulator, first_guess or {}, wanted)
     guess = {name: _guess(name, limits, known) for name, limits in bounds.items()}
     seconds = _learned(motions, replays, seconds)
     first_search = (guess, starts, many, seed)
-    searched = (simulator, motions, bounds, trials, accuracy, seconds, first_search, max_evaluations, tolerance)
+    searched = (
+        simulator,
+        motions,
+        bounds,
+        trials,
+        accuracy,
+        seconds,
+        first_search,
+        max_evaluations,
+        tolerance,
+    )
 
     def begin(before: Identification | None) -> tuple[Misfit, list[dict[str, float]]]:
-        again = replays if before is None else [(replay, motions.start(replay, before)) for replay, _ in replays]
+        again = (
+            replays
+            if before is None
+            else [(replay, motions.start(replay, before)) for replay, _ in replays]
+        )
         misfit = _misfit(motions, again, bounds, seconds, accuracy)
         first = first_search if before is None else (before.parameters,)
         return misfit, first_points(misfit, *first)
@@ -141,20 +176,29 @@ def _misfit(
     return Misfit(replays, bounds, seconds, accuracy, known, motions.release.delay, shares)
 
 
-def _learned(motions: ObservedMotions, replays: Sequence[tuple[Replay, Start]], seconds: float | None) -> float | None:
+def _learned(
+    motions: ObservedMotions, replays: Sequence[tuple[Replay, Start]], seconds: float | None
+) -> float | None:
     """Duration from the beginning of each trial that is used [s]; None for whole trials."""
     if motions.train_fraction == 1.0:
         return seconds
-    return min(motions.train_fraction * max(float(r.trials.times.max()) for r, _ in replays), seconds or math.inf)
+    return min(
+        motions.train_fraction * max(float(r.trials.times.max()) for r, _ in replays),
+        seconds or math.inf,
+    )
 
 
-def _bounds_of_owners(ranges: Mapping[str, Bounds], trials: Trials, names: Sequence[str]) -> dict[str, Bounds]:
+def _bounds_of_owners(
+    ranges: Mapping[str, Bounds], trials: Trials, names: Sequence[str]
+) -> dict[str, Bounds]:
     """Bounds of all parameters, and of the values of trials and sessions."""
     owners = {"session": list(dict.fromkeys(map(trials.session, names))), "trial": [*names]}
     return {
         full: limits
         for name, limits in ranges.items()
-        for full in ([value_name(name, owner) for owner in owners[limits.owner]] if limits.owner else [name])
+        for full in (
+            [value_name(name, owner) for owner in owners[limits.owner]] if limits.owner else [name]
+        )
     }
 
 
@@ -164,15 +208,25 @@ def _guess(name: str, bounds: Bounds, known: Mapping[str, float]) -> float:
     return bounds.prior.mean if owner and bounds.prior is not None else known[parameter]
 
 
-def _joined(rounds: Sequence[Identification], guess: Mapping[str, float], accuracy: Accuracy | None) -> Identification:
-    """The result of the last round with the history of all, and the expected places in a new session."""
-    history = [[*records] for records in rounds[0].history]  # of the starts, of which the best continues
+def _joined(
+    rounds: Sequence[Identification], guess: Mapping[str, float], accuracy: Accuracy | None
+) -> Identification:
+    """The result of the last round with the history of all,
+    and the expected places in a new session.
+    """
+    # Of the starts, of which the best continues.
+    history = [[*records] for records in rounds[0].history]
     best = min(
-        (records for records in history if records), key=lambda records: min(record["loss"] for record in records)
+        (records for records in history if records),
+        key=lambda records: min(record["loss"] for record in records),
     )
     best.extend(record for later in rounds[1:] for record in later.history[0])
     found = replace(rounds[-1], history=history, first_guess=guess)
-    if found.placement is None or accuracy is None or not (sessions := found.placement.get("sessions")):
+    if (
+        found.placement is None
+        or accuracy is None
+        or not (sessions := found.placement.get("sessions"))
+    ):
         return found
     like = torch.zeros(len(found.placement["offsets"]), 3, dtype=torch.float64)
     expected = accuracy.of_new_session(like, len(sessions)).tolist()
@@ -181,21 +235,27 @@ def _joined(rounds: Sequence[Identification], guess: Mapping[str, float], accura
 
 
 def _separated(found: Identification, ranges: Mapping[str, Bounds]) -> Identification:
-    """An identification with the values of trials and sessions in `of_trials`, apart from those of all trials.
+    """An identification with the values of trials and sessions in `of_trials`,
+    apart from those of all trials.
 
-    The common value, which other trials and sessions have before `_with_first_frames`, is the mean of the prior for
-    trials and of the identified ones for sessions; its uncertainty is the deviation of the prior.
+    The common value, which other trials and sessions have before `_with_first_frames`, is the mean
+    of the prior for trials and of the identified ones for sessions; its uncertainty is the
+    deviation of the prior.
     """
     priors = {name: one.prior for name, one in ranges.items() if one.owner and one.prior}
     if not priors:
         return found
     for name in (name for name in priors if ranges[name].owner == "session"):
-        of_sessions = [value for full, value in found.parameters.items() if split_name(full)[0] == name]
+        of_sessions = [
+            value for full, value in found.parameters.items() if split_name(full)[0] == name
+        ]
         priors[name] = priors[name].changed(mean=fmean(of_sessions))
     names = [*found.parameters]
     common = [name for name in names if not split_name(name)[1]]
     of_trials = {name: value for name, value in found.parameters.items() if split_name(name)[1]}
-    parameters = {name: found.parameters[name] for name in common} | {name: p.mean for name, p in priors.items()}
+    parameters = {name: found.parameters[name] for name in common} | {
+        name: p.mean for name, p in priors.items()
+    }
     found = replace(found, parameters=parameters, of_trials=of_trials)
     if (uncertainty := found.uncertainty) is None:
         return found
@@ -204,26 +264,36 @@ def _separated(found: Identification, ranges: Mapping[str, Bounds]) -> Identific
     correlation[: len(rows), : len(rows)] = np.array(uncertainty.correlation)[np.ix_(rows, rows)]
     changed = replace(
         uncertainty,
-        deviation={n: uncertainty.deviation[n] for n in common} | {n: p.deviation for n, p in priors.items()},
+        deviation={n: uncertainty.deviation[n] for n in common}
+        | {n: p.deviation for n, p in priors.items()},
         correlation=correlation.tolist(),
         poorest={n: uncertainty.poorest[n] for n in common} | dict.fromkeys(priors, 0.0),
-        ranges={n: uncertainty.ranges[n] for n in common} | {n: ranges[n].upper - ranges[n].lower for n in priors},
+        ranges={n: uncertainty.ranges[n] for n in common}
+        | {n: ranges[n].upper - ranges[n].lower for n in priors},
         left_out={},  # A trial that is left out has no values of its own.
     )
     return replace(
-        found, uncertainty=changed, of_trials_deviation={name: uncertainty.deviation[name] for name in of_trials}
+        found,
+        uncertainty=changed,
+        of_trials_deviation={name: uncertainty.deviation[name] for name in of_trials},
     )
 
 
 def _shown_first(
-    motions: ObservedMotions, train: Sequence[str], held_out: Sequence[str], ranges: Mapping[str, Bounds]
+    motions: ObservedMotions,
+    train: Sequence[str],
+    held_out: Sequence[str],
+    ranges: Mapping[str, Bounds],
 ) -> list[tuple[list[str], dict[str, Bounds]]]:
-    """Held-out trials, all of a new session or one, and the bounds of the values that their first frames show.
+    """Held-out trials, all of a new session or one,
+    and the bounds of the values that their first frames show.
 
     Raises:
         InputError: these frames show no marker.
     """
-    trials, seconds, groups = motions.trials, motions.release.window, dict[tuple[str, str], list[str]]()
+    trials = motions.trials
+    seconds = motions.release.window
+    groups = dict[tuple[str, str], list[str]]()
     known = {*map(trials.session, train)}
     for name in (name for name in held_out if trials.begin_of(name) in RESTING):
         session = trials.session(name)
@@ -231,7 +301,9 @@ def _shown_first(
     shown = list[tuple[list[str], dict[str, Bounds]]]()
     for (session, trial), names in groups.items():
         owners = ("trial",) if trial else ("session", "trial")
-        if not (wanted := {name: limits for name, limits in ranges.items() if limits.owner in owners}):
+        if not (
+            wanted := {name: limits for name, limits in ranges.items() if limits.owner in owners}
+        ):
             continue
         times, observed = (x[trials.rows(names)] for x in (trials.times, trials.observed))
         frames = np.isfinite(observed).all(-1).any(-1) & (times <= seconds + 1e-9)
@@ -239,8 +311,9 @@ def _shown_first(
         if not seen:
             of = "the trial" if trial else f"the session {session!r}"
             raise InputError(
-                f"no marker is seen in the first {seconds:g} s of {listed(names)}, from which values of {of} are "
-                "estimated: raise release.window, or leave out what has no marker."
+                f"no marker is seen in the first {seconds:g} s of {listed(names)}, from which "
+                f"values of {of} are estimated: raise release.window, "
+                "or leave out what has no marker."
             )
         shown.append((seen, _bounds_of_owners(wanted, trials, seen)))
     return shown
@@ -254,24 +327,34 @@ def _with_first_frames(
     bounds: Mapping[str, Bounds],
     max_evaluations: int,
 ) -> Identification:
-    """Adds values of trials and their session from first frames (`ReleaseSettings.window`), and their deviations.
+    """Adds values of trials and their session from first frames (`ReleaseSettings.window`), and
+    their deviations.
 
-    Everything else is as identified. Values that these frames do not show stay near the common value.
+    Everything else is as identified. Values that these frames do not show stay near the common
+    value.
     """
     known, window = {**found.parameters, **found.of_trials}, motions.release.window
     guess = {full: found.parameters[split_name(full)[0]] for full in bounds}
     bounds = {
-        full: limits if limits.prior is None else limits.changed(prior=limits.prior.changed(mean=guess[full]))
+        full: limits
+        if limits.prior is None
+        else limits.changed(prior=limits.prior.changed(mean=guess[full]))
         for full, limits in bounds.items()
     }
     try:
         replays = motions.replays(simulator, names, found)
-        result = search_parameters(_misfit(motions, replays, bounds, window, known=known), [guess], max_evaluations)
+        result = search_parameters(
+            _misfit(motions, replays, bounds, window, known=known), [guess], max_evaluations
+        )
     except ConvergenceError as error:
-        log.warning("identify: the first frames of %s show none of their values: %s", listed(names), error)
+        log.warning(
+            "identify: the first frames of %s show none of their values: %s", listed(names), error
+        )
         return found
     owners = dict.fromkeys(split_name(full)[1] for full in bounds)
-    first = {owner: {name: window for name in ([owner] if owner in names else names)} for owner in owners}
+    first = {
+        owner: {name: window for name in ([owner] if owner in names else names)} for owner in owners
+    }
     return replace(
         found,
         of_trials={**found.of_trials, **result.parameters},

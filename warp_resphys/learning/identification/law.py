@@ -1,9 +1,10 @@
-"""Laws of a material: classes of convex terms, and the smallest coefficients that balance the forces of motions.
+"""Laws of a material: classes of convex terms, and the smallest coefficients
+that balance the forces of motions.
 
-The terms are those of `energies.convex_material.ConvexMaterial`, with the coefficients of the weak form (`weak_form`).
-It decides which groups of terms a law needs: elastic terms beyond the modulus, viscosity, branches of relaxation, and
-families of fibres. Relaxation times and directions of fibres come from a grid, and are refined with the coefficients
-through the simulator (`law_search`).
+The terms are those of `energies.convex_material.ConvexMaterial`, with the coefficients of the weak
+form (`weak_form`). It decides which groups of terms a law needs: elastic terms beyond the modulus,
+viscosity, branches of relaxation, and families of fibres. Relaxation times and directions of fibres
+come from a grid, and are refined with the coefficients through the simulator (`law_search`).
 """
 
 import math
@@ -35,7 +36,9 @@ _SAME: Final = 1.6  # ratio of neighbouring relaxation times that are one branch
 _FINER: Final = math.radians(15.0)  # of the finer directions about the best coarse one
 _LEAST: Final = 1e-3  # fraction of the shear modulus below which a coefficient is zero
 _STIFFEST: Final = 500.0  # bulk over shear modulus, as of a Poisson's ratio of 0.4995
-_OFF_THE_POLE: Final = 0.2  # rad, of fibres along z at first: exactly there, their azimuth has no effect
+_OFF_THE_POLE: Final = (
+    0.2  # rad, of fibres along z at first: exactly there, their azimuth has no effect
+)
 _TURN: Final = 0.8  # largest correction of a fibre's angle [rad]
 
 
@@ -52,7 +55,8 @@ class IdentifiedLaw:
         at_bounds: names of those that ended on a bound.
         validation: errors on the trials that the law was tested on.
         model: name of the material's class.
-        groups: groups of terms besides the modulus; this and what follows is None of a law that was known.
+        groups: groups of terms besides the modulus; this and what follows is None of a law that was
+            known.
         loss: of the identification.
         classes: classes that were tried.
         stretches: least and largest principal stretch in the trials that it was identified from.
@@ -76,7 +80,11 @@ class IdentifiedLaw:
     def plain(self) -> dict[str, Any]:
         """Returns the law as JSON data."""
         hidden = ("simulator", "trials")
-        known = {key: value for key, value in vars(self).items() if value is not None and key not in hidden}
+        known = {
+            key: value
+            for key, value in vars(self).items()
+            if value is not None and key not in hidden
+        }
         return {**known, **law_content(self.model, self.parameters)}
 
 
@@ -109,26 +117,37 @@ class _Columns:
         self.candidates += candidates
         if candidates:
             pairs = zip(self._columns, self._forms, strict=True)
-            self._columns = [np.concatenate([old, form.columns(candidates)], axis=1) for old, form in pairs]
+            self._columns = [
+                np.concatenate([old, form.columns(candidates)], axis=1) for old, form in pairs
+            ]
             pairs = zip(self._columns, self._forms, strict=True)
             self._normal = [NormalEquations.of(columns, form.target) for columns, form in pairs]
         return list(range(first, len(self.candidates)))
 
     def fit(self, indices: Sequence[int]) -> tuple[FloatArray, float]:
-        """Returns the coefficients, and the residual of the held-out motions, or of the training motions."""
+        """Returns the coefficients, and the residual of the held-out motions,
+        or of the training motions.
+        """
         found = self._normal[0].fit(indices)
         return found, self._normal[-1].residual(indices, found)
 
 
 def fit_classes(
-    train: WeakForm, held_out: WeakForm | None, terms: Sequence[str], times: Sequence[float], families: int = 1
+    train: WeakForm,
+    held_out: WeakForm | None,
+    terms: Sequence[str],
+    times: Sequence[float],
+    families: int = 1,
 ) -> list[LawClass]:
-    """Returns the law of every class, from the smallest to the largest; of equal laws, that of the smallest class.
+    """Returns the law of every class, from the smallest to the largest.
+
+    Of equal laws, that of the smallest class.
 
     Args:
-        train: balance of the training motions; its simulator has the terms of the library, one branch and a family of
-            fibres.
-        held_out: balance of the held-out motions; None: residuals are those of the training motions.
+        train: balance of the training motions; its simulator has the terms of the library, one
+            branch and a family of fibres.
+        held_out: balance of the held-out motions; None: residuals are those of the training
+            motions.
         terms: elastic terms by name, as in `ConvexMaterial`, besides `MODULUS`.
         times: relaxation times of branches [s], ascending; none: no branches.
         families: largest number of families of fibres.
@@ -138,7 +157,9 @@ def fit_classes(
     groups = {
         "elastic": columns.add([{name: UNIT} for name in terms]),
         "viscosity": columns.add([{name: _UNIT_VISCOSITY} for name in VISCOSITIES]),
-        "branches": columns.add([{"prony_modulus_1": UNIT, "prony_time_1": time} for time in times]),
+        "branches": columns.add(
+            [{"prony_modulus_1": UNIT, "prony_time_1": time} for time in times]
+        ),
     }
     base = modulus + list(chain.from_iterable(groups.values()))
     groups["fibres"] = _families(columns, base, families)
@@ -168,7 +189,10 @@ def _families(columns: _Columns, base: Sequence[int], most: int) -> list[int]:
 
 def _fibres(direction: FloatArray) -> dict[str, float]:
     x, y, z = direction / np.linalg.norm(direction)
-    angles = {"fibre_azimuth_1": math.atan2(y, x), "fibre_elevation_1": math.asin(min(max(z, -1.0), 1.0))}
+    angles = {
+        "fibre_azimuth_1": math.atan2(y, x),
+        "fibre_elevation_1": math.asin(min(max(z, -1.0), 1.0)),
+    }
     return {"fibre_tension_1": UNIT, **angles}
 
 
@@ -181,19 +205,27 @@ def _half_sphere() -> list[FloatArray]:
 def _around(azimuth: float, elevation: float) -> list[FloatArray]:
     """Returns eight directions around one."""
     axis = np.array(
-        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
+        [
+            math.cos(elevation) * math.cos(azimuth),
+            math.cos(elevation) * math.sin(azimuth),
+            math.sin(elevation),
+        ]
     )
     across = np.linalg.svd(axis[None])[2][1:]
     turns = np.linspace(0.0, 2.0 * np.pi, 9)[:-1]
-    return [axis + math.tan(_FINER) * (np.cos(t) * across[0] + np.sin(t) * across[1]) for t in turns]
+    return [
+        axis + math.tan(_FINER) * (np.cos(t) * across[0] + np.sin(t) * across[1]) for t in turns
+    ]
 
 
 def _sparse(columns: _Columns, modulus: Sequence[int], others: Sequence[int]) -> list[int]:
-    """Returns the members without those whose absence the residual hardly shows, starting with the least."""
+    """Members without those whose absence the residual hardly shows, starting with the least."""
     coefficients, residual = columns.fit([*modulus, *others])
     kept = [k for k, value in zip(others, coefficients[len(modulus) :], strict=True) if value > 0.0]
     while kept:
-        without = {k: columns.fit([*modulus, *(other for other in kept if other != k)])[1] for k in kept}
+        without = {
+            k: columns.fit([*modulus, *(other for other in kept if other != k)])[1] for k in kept
+        }
         least = min(kept, key=lambda k: without[k])
         if without[least] > max(_NEEDLESS * residual, _ROUNDING):
             break
@@ -202,14 +234,22 @@ def _sparse(columns: _Columns, modulus: Sequence[int], others: Sequence[int]) ->
 
 
 def _parameters(candidates: Sequence[Candidate], coefficients: FloatArray) -> dict[str, float]:
-    """Returns the parameters of a `ConvexMaterial`; neighbouring relaxation times become one branch."""
-    parameters, branches, families = dict[str, float](), list[list[float]](), list[dict[str, float]]()
+    """Returns the parameters of a `ConvexMaterial`.
+
+    Neighbouring relaxation times become one branch.
+    """
+    parameters = dict[str, float]()
+    branches = list[list[float]]()
+    families = list[dict[str, float]]()
     for candidate, factor in zip(candidates, coefficients.tolist(), strict=True):
         if "prony_time_1" in candidate:
             modulus, time = factor * UNIT, candidate["prony_time_1"]
             if branches and time < _SAME * branches[-1][1]:
                 total = branches[-1][0] + modulus
-                branches[-1] = [total, branches[-1][1] ** (branches[-1][0] / total) * time ** (modulus / total)]
+                branches[-1] = [
+                    total,
+                    branches[-1][1] ** (branches[-1][0] / total) * time ** (modulus / total),
+                ]
             else:
                 branches.append([modulus, time])
         elif "fibre_tension_1" in candidate:
@@ -253,9 +293,9 @@ def bounds_of_parameter(
 ) -> Bounds:
     """Returns the range of a parameter of a law, around a first value, and its prior.
 
-    The priors have the weight of one observation. They hold what the trials do not excite: moduli and viscosities near
-    those of the first guess, and further terms near zero. At small strains, markers do not tell c10 from these, and the
-    neo-Hookean law extrapolates best from there.
+    The priors have the weight of one observation. They hold what the trials do not excite: moduli
+    and viscosities near those of the first guess, and further terms near zero. At small strains,
+    markers do not tell c10 from these, and the neo-Hookean law extrapolates best from there.
 
     Args:
         name: of the parameter.
@@ -268,9 +308,18 @@ def bounds_of_parameter(
     if name == "bulk_1":
         mean = max(value, shear)
         most = max(10.0 * mean, _STIFFEST * shear)
-        return Bounds(lower=0.1 * mean, upper=most, logarithmic=True, prior=Prior(mean=mean, deviation=3.0 * mean))
+        return Bounds(
+            lower=0.1 * mean,
+            upper=most,
+            logarithmic=True,
+            prior=Prior(mean=mean, deviation=3.0 * mean),
+        )
     if name == "c10":
-        return Bounds(lower=0.0, upper=max(4.0 * value, shear), prior=modulus or Prior(mean=value, deviation=shear))
+        return Bounds(
+            lower=0.0,
+            upper=max(4.0 * value, shear),
+            prior=modulus or Prior(mean=value, deviation=shear),
+        )
     if name.startswith("prony_time"):
         return Bounds(lower=value / 4.0, upper=4.0 * value, logarithmic=True)
     if name.startswith(("fibre_azimuth", "fibre_elevation")):
@@ -284,7 +333,9 @@ def bounds_of_parameter(
         most = (0.01 if name == "shear_viscosity" else 1.0) * shear
         prior = Prior(mean=known, deviation=known) if known > 1e-6 * shear else None
         return Bounds(lower=0.0, upper=max(4.0 * value, 4.0 * known, most), prior=prior)
-    return Bounds(lower=0.0, upper=max(4.0 * value, shear), prior=Prior(mean=0.0, deviation=deviation * shear))
+    return Bounds(
+        lower=0.0, upper=max(4.0 * value, shear), prior=Prior(mean=0.0, deviation=deviation * shear)
+    )
 
 
 def is_shape(name: str) -> bool:
@@ -293,13 +344,18 @@ def is_shape(name: str) -> bool:
 
 
 def strong_names(parameters: Mapping[str, float], shear: float) -> dict[str, str]:
-    """Names of parameters by their names without terms, branches and families that hardly resist, which are left out.
+    """Names of parameters by their names without terms,
+    branches and families that hardly resist, which are left out.
 
     Args:
         parameters: of a law.
         shear: shear modulus of the material [Pa].
     """
-    weak = {name for name, value in parameters.items() if unit_of(name) == "Pa" and value < _LEAST * shear}
+    weak = {
+        name
+        for name, value in parameters.items()
+        if unit_of(name) == "Pa" and value < _LEAST * shear
+    }
     weak |= {name for name in VISCOSITIES if parameters.get(name, 1.0) < 1e-6 * shear}
     kept = {
         name: name
@@ -308,17 +364,31 @@ def strong_names(parameters: Mapping[str, float], shear: float) -> dict[str, str
     }
     for leading in ("prony_modulus_", "fibre_tension_"):
         group = leading.split("_")[0]
-        strong = [name.removeprefix(leading) for name in parameters if name.startswith(leading) and name not in weak]
+        strong = [
+            name.removeprefix(leading)
+            for name in parameters
+            if name.startswith(leading) and name not in weak
+        ]
         for number, old in enumerate(strong, 1):
-            members = [name for name in parameters if name.startswith(group) and name.endswith(f"_{old}")]
+            members = [
+                name for name in parameters if name.startswith(group) and name.endswith(f"_{old}")
+            ]
             kept |= {f"{name.removesuffix(old)}{number}": name for name in members}
     return kept
 
 
-def branches_of(moduli: Sequence[float], times: Sequence[float], first: int = 1) -> dict[str, float]:
-    """Parameters of branches by their moduli [Pa] and relaxation times [s], numbered from `first`."""
+def branches_of(
+    moduli: Sequence[float], times: Sequence[float], first: int = 1
+) -> dict[str, float]:
+    """Parameters of branches by their moduli [Pa] and relaxation times [s],
+    numbered from `first`.
+    """
     pairs = enumerate(zip(moduli, times, strict=True), first)
-    return {key: x for k, (m, t) in pairs for key, x in ((f"prony_modulus_{k}", m), (f"prony_time_{k}", t))}
+    return {
+        key: x
+        for k, (m, t) in pairs
+        for key, x in ((f"prony_modulus_{k}", m), (f"prony_time_{k}", t))
+    }
 
 
 def family(tension: float, direction: tuple[float, float] = (0.0, 0.0)) -> dict[str, float]:

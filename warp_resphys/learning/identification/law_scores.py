@@ -1,4 +1,6 @@
-"""Laws that are refined through the simulator: their errors, a search by these, and the stretches of a body."""
+"""Laws that are refined through the simulator: their errors,
+a search by these, and the stretches of a body.
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -21,8 +23,11 @@ from ..start import Start
 from .law import LawClass, branches_of, family, longest_side
 from .search import Identification
 
-_RUBBERY: Final = 25.0  # least bulk over shear modulus in the first guess of a search; Poisson's ratio of 0.49
-_MEMBERS: Final = {"branches": ("prony",), "fibres": ("fibre",)}  # names of parameters of a group begin with these
+_RUBBERY: Final = (
+    25.0  # least bulk over shear modulus in the first guess of a search; Poisson's ratio of 0.49
+)
+# Names of parameters of a group begin with these.
+_MEMBERS: Final = {"branches": ("prony",), "fibres": ("fibre",)}
 
 
 @dataclass(frozen=True)
@@ -71,7 +76,8 @@ def stretches_in(
     parameters: Mapping[str, float],
     identified: Identified,
 ) -> list[float]:
-    """Returns the least and the largest principal stretch of a body in trials, simulated where markers are seen.
+    """Returns the least and the largest principal stretch of a body in trials,
+    simulated where markers are seen.
 
     Args:
         motions: the trials.
@@ -87,19 +93,28 @@ def stretches_in(
         values = {name: simulator.tensor([value]) for name, value in parameters.items()}
         with torch.no_grad():
             replays = motions.replays(simulator, names, identified)
-            whole = [(replay.changed(simulator=simulator, observe=WHOLE_STATE), start) for replay, start in replays]
-            bodies = [replay(replace(start, shift=None), values).cpu().numpy() for replay, start in whole]
+            whole = [
+                (replay.changed(simulator=simulator, observe=WHOLE_STATE), start)
+                for replay, start in replays
+            ]
+            bodies = [
+                replay(replace(start, shift=None), values).cpu().numpy() for replay, start in whole
+            ]
     parts = [principal_stretches(mesh, body.reshape(-1, *mesh.vertices.shape)) for body in bodies]
     return [float(min(map(np.nanmin, parts))), float(max(map(np.nanmax, parts)))]
 
 
 def tried_without_states(
-    refine: Callable[[LawClass], RefinedLaw], guess: Mapping[str, float], wanted: LawSettings, mesh: Mesh
+    refine: Callable[[LawClass], RefinedLaw],
+    guess: Mapping[str, float],
+    wanted: LawSettings,
+    mesh: Mesh,
 ) -> list[RefinedLaw]:
     """Returns the classes that were tried through the simulator, the best last.
 
-    The search begins with all groups of terms, and takes away those without which validation trials are as close:
-    a class that lacks a group makes up for it with others, from where the group no longer helps.
+    The search begins with all groups of terms, and takes away those without which validation trials
+    are as close: a class that lacks a group makes up for it with others, from where the group no
+    longer helps.
 
     Args:
         refine: refines a law through the simulator.
@@ -124,12 +139,18 @@ def tried_without_states(
     best = refine(LawClass(tuple(groups), start | whole, math.nan))
     tried = [best]
     for name in groups:
-        left = {n: x for n, x in best.law.parameters.items() if not n.startswith(_MEMBERS.get(name, wanted.terms))}
+        left = {
+            n: x
+            for n, x in best.law.parameters.items()
+            if not n.startswith(_MEMBERS.get(name, wanted.terms))
+        }
         if name == "branches":
             left |= creep
         if name == "elastic":  # They may have been all that resists shear.
             left["c10"] = max(left["c10"], guess["c10"])
-        smaller = LawClass(tuple(group for group in best.law.groups if group != name), left, math.nan)
+        smaller = LawClass(
+            tuple(group for group in best.law.groups if group != name), left, math.nan
+        )
         if left == best.law.parameters:  # The search has left nothing of the group.
             best = replace(best, law=smaller)
             continue

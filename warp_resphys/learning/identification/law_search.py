@@ -1,10 +1,11 @@
 """Identification of the law of a material, which is accepted if it helps on validation trials.
 
-Where the trials give the positions of all vertices, the weak form fits every class of laws (`law`), and the smallest
-one that is close to the best on the validation trials is refined through the simulator, and larger ones that balance
-the forces clearly better, too. With markers alone, the search begins with all groups of terms and takes one after the
-other away, each time refined through the simulator, if the validation trials are as close without it. The other
-identified parameters are refined with the law.
+Where the trials give the positions of all vertices, the weak form fits every class of laws (`law`),
+and the smallest one that is close to the best on the validation trials is refined through the
+simulator, and larger ones that balance the forces clearly better, too. With markers alone, the
+search begins with all groups of terms and takes one after the other away, each time refined through
+the simulator, if the validation trials are as close without it. The other identified parameters are
+refined with the law.
 """
 
 import math
@@ -48,9 +49,13 @@ from .search import Identification, first_points, refined_searches
 from .weak_form import KnownMotion, WeakForm
 
 _OF_MASS: Final = ("density", MASS_DAMPING)
-_FURTHER: Final = 0.2  # standard deviation of the priors of further terms from markers, over the shear modulus
+_FURTHER: Final = (
+    0.2  # standard deviation of the priors of further terms from markers, over the shear modulus
+)
 _HELD_OUT: Final = 4  # every fourth training trial
-_EARLY: Final = 0.6  # of the training trials that a law is tested on as well: share from which it is identified
+_EARLY: Final = (
+    0.6  # of the training trials that a law is tested on as well: share from which it is identified
+)
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
 _STRIDE: Final = 10  # steps from one balance of forces to the next, where all vertices are observed
 _FIXED: Final = ("fibre_stiffening", "fibre_compression")  # parameters that are not refined
@@ -74,29 +79,37 @@ def identify_law(
 ) -> IdentifiedLaw:
     """Identifies the law of a material from observed motions, and tests it on others.
 
-    Without validation trials, every fourth training trial takes their place until a law is chosen; of three motions or
-    fewer, the last part, of which `identify` has seen all.
+    Without validation trials, every fourth training trial takes their place until a law is chosen;
+    of three motions or fewer, the last part, of which `identify` has seen all.
 
     Args:
-        simulator: of the body, with a material of a simpler class; the law begins with its parameters.
+        simulator: of the body, with a material of a simpler class; the law begins with its
+            parameters.
         motions: observed states or markers.
-        parameters: ranges that `identify` had; parameters that are not of the material are refined with the law.
+        parameters: ranges that `identify` had; parameters that are not of the material are refined
+            with the law.
         identified: result of `identify`; the simulator's own values if None.
         train: names of the training trials; all by default.
         validation: names of the validation trials.
         settings: terms, relaxation times and evaluations; the defaults of the class if None.
-        seconds: duration of the trials that may be learned from [s]; None for the part that `motions` learns from.
+        seconds: duration of the trials that may be learned from [s]; None for the part that
+            `motions` learns from.
         known: law beside which the parameters are identified; None to identify a law.
         kept: see `identify`.
 
     Raises:
-        InputError: materials of regions, a range of an unknown parameter, or a law of another version.
+        InputError: materials of regions, a range of an unknown parameter, or a law of another
+            version.
         ConvergenceError: the simulation fails at every start.
     """
     if "" not in simulator.materials:
-        raise InputError("a law describes one material, but the simulator has some by region: give a single one.")
+        raise InputError(
+            "a law describes one material, but the simulator has some by region: give a single one."
+        )
     if known is not None and not {"model", "parameters"} <= {*known}:
-        raise InputError(f"known has {', '.join(known)}: a law of this version has model and parameters.")
+        raise InputError(
+            f"known has {', '.join(known)}: a law of this version has model and parameters."
+        )
     motions.need_points("a law")
     wanted = ranges_of(parameters or {})
     with naming("parameters: "):
@@ -129,25 +142,36 @@ class _LawSearch:
     @cached_property
     def checked(self) -> tuple[str, ...]:
         """Names of the trials that laws are tested on."""
-        held_out = self.train[_HELD_OUT // 2 :: _HELD_OUT] if len(self.train) >= _HELD_OUT else self.train
+        held_out = (
+            self.train[_HELD_OUT // 2 :: _HELD_OUT] if len(self.train) >= _HELD_OUT else self.train
+        )
         return self.validation or held_out
 
     def names(self, whole: bool) -> tuple[str, ...]:
-        """Names of the trials of a search: all of the training, or those that a law is identified from at first."""
+        """Names of the trials of a search: all of the training,
+        or those that a law is identified from at first.
+        """
         split = whole or self.validation or self.checked == self.train
-        names = self.train if split else tuple(name for name in self.train if name not in self.checked)
+        names = (
+            self.train if split else tuple(name for name in self.train if name not in self.checked)
+        )
         return names if self.settings.trials is None else tuple(evenly(names, self.settings.trials))
 
     @property
     def early(self) -> float | None:
-        """Duration from which a law is identified before it is tested on the same trials [s]; None with others."""
+        """Duration from which a law is identified before it is tested on the same trials [s].
+
+        None with others.
+        """
         longest = self.seconds or float(self.motions.trials.times.max())
         return _EARLY * longest if self.checked == self.train and longest > 0.0 else None
 
     @cached_property
     def known(self) -> dict[str, float]:
         """Parameters of the material as it was identified."""
-        known = {name: float(torch.as_tensor(x)) for name, x in self.base.materials[""].values.items()}
+        known = {
+            name: float(torch.as_tensor(x)) for name, x in self.base.materials[""].values.items()
+        }
         return known | {name: x for name, x in self.identified.parameters.items() if name in known}
 
     @property
@@ -165,16 +189,26 @@ class _LawSearch:
         """Shear modulus of the identified material [Pa]."""
         return 2.0 * self.guess["c10"]
 
-    def simulator(self, parameters: Mapping[str, float], model: str = ConvexMaterial.model) -> Simulator:
+    def simulator(
+        self, parameters: Mapping[str, float], model: str = ConvexMaterial.model
+    ) -> Simulator:
         """Returns the simulator with the parameters of a law; failed steps are counted."""
         material = make_material(model, **{**self.mass, **parameters})
-        return replace(self.base, material=material, solver=self.base.settings.changed(on_failure="count"))
+        return replace(
+            self.base, material=material, solver=self.base.settings.changed(on_failure="count")
+        )
 
     @cached_property
     def others(self) -> dict[str, float]:
-        """Identified parameters beside the law: density and damping by mass, and those of other parts."""
+        """Identified parameters beside the law: density and damping by mass,
+        and those of other parts.
+        """
         material = {*self.base.materials[""].parameters} - {*_OF_MASS}
-        return {name: float(value) for name, value in self.identified.parameters.items() if name not in material}
+        return {
+            name: float(value)
+            for name, value in self.identified.parameters.items()
+            if name not in material
+        }
 
     def run(self) -> IdentifiedLaw:
         """Identifies a law."""
@@ -185,13 +219,18 @@ class _LawSearch:
             smallest = next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
             best = self._enlarged(self._refine(classes[smallest]), classes)
         else:
-            refined = tried_without_states(self._refine, self.guess, self.settings, self.base.body.mesh)
-            classes, scores = [tried.law for tried in refined], [tried.score.error for tried in refined]
+            refined = tried_without_states(
+                self._refine, self.guess, self.settings, self.base.body.mesh
+            )
+            classes = [tried.law for tried in refined]
+            scores = [tried.score.error for tried in refined]
             best = refined[-1]
         if not self.validation:
             again = self._refine(best.law, whole=True)
             best = best if best.score.beats(again.score) else replace(again, score=best.score)
-        parameters = {name: best.others.get(name, x) for name, x in self.mass.items()} | best.law.parameters
+        parameters = {
+            name: best.others.get(name, x) for name, x in self.mass.items()
+        } | best.law.parameters
         deviation, trials = best.found.deviation, self.names(whole=True)
         return IdentifiedLaw(
             simulator=self.simulator(parameters),
@@ -202,11 +241,20 @@ class _LawSearch:
             at_bounds=[name for name, old in best.names.items() if old in best.found.at_bounds],
             loss=best.found.loss,
             classes=[
-                TriedClass(groups=[*law.groups], parameters=law.parameters, residual=law.residual, validation=score)
+                TriedClass(
+                    groups=[*law.groups],
+                    parameters=law.parameters,
+                    residual=law.residual,
+                    validation=score,
+                )
                 for law, score in zip(classes, scores, strict=True)
             ],
             stretches=stretches_in(
-                self.motions, trials, self.simulator(best.law.parameters), best.others, self.identified
+                self.motions,
+                trials,
+                self.simulator(best.law.parameters),
+                best.others,
+                self.identified,
             ),
             trials=trials,
             **self._tested(best.score),
@@ -219,7 +267,9 @@ class _LawSearch:
         bounds, found = self._bounds_of_others, Identification()
         if bounds:
             limits = (self.seconds, self.settings.seconds)
-            found = self._search(_BESIDE, bounds, lambda before: (simulator, {}), self.names(whole=True), limits)
+            found = self._search(
+                _BESIDE, bounds, lambda before: (simulator, {}), self.names(whole=True), limits
+            )
         values = {name: simulator.tensor([value]) for name, value in found.parameters.items()}
         return IdentifiedLaw(
             simulator=simulator,
@@ -232,14 +282,21 @@ class _LawSearch:
         )
 
     def _tested(self, score: Score) -> dict[str, Any]:
-        """Whether a law helps, and its errors and those without it on the trials that laws are tested on."""
-        shared = {name: self.base.tensor([value]) for name, value in self.identified.parameters.items()}
+        """Whether a law helps, and its errors and those without it on the trials
+        that laws are tested on.
+        """
+        shared = {
+            name: self.base.tensor([value]) for name, value in self.identified.parameters.items()
+        }
         counting = replace(self.base, solver=self.base.settings.changed(on_failure="count"))
-        below, split = self._scores(counting, shared)[0], "validation" if self.validation else "training"
+        below = self._scores(counting, shared)[0]
+        split = "validation" if self.validation else "training"
         errors = LawTest(trials=[*self.checked], split=split, law=score.error, below=below.error)
         return {"accepted": score.beats(below), "validation": errors}
 
-    def scores(self, laws: Sequence[Mapping[str, float]], others: Mapping[str, float] | None = None) -> list[Score]:
+    def scores(
+        self, laws: Sequence[Mapping[str, float]], others: Mapping[str, float] | None = None
+    ) -> list[Score]:
         """Returns the errors of laws on the trials that they are tested on.
 
         Args:
@@ -250,13 +307,15 @@ class _LawSearch:
         for law in laws:
             union |= {name: value if is_shape(name) else 0.0 for name, value in law.items()}
         simulator = self.simulator({**union, **laws[0]})
-        values = {name: simulator.tensor([law.get(name, union[name]) for law in laws]) for name in union}
+        values = {
+            name: simulator.tensor([law.get(name, union[name]) for law in laws]) for name in union
+        }
         for name, value in {**self.others, **(others or {})}.items():
             values[name] = simulator.tensor([value]).expand(len(laws))
         return self._scores(simulator, values)
 
     def _scores(self, simulator: Simulator, values: Mapping[str, torch.Tensor]) -> list[Score]:
-        """Returns the errors of a simulator with some sets of parameters on the trials that laws are tested on."""
+        """Errors of a simulator with some sets of parameters on trials that laws are tested on."""
         replays = self.motions.replays(simulator, self.checked, self.identified)
         return scores_of(replays, values, self.early or 0.0, self.seconds)
 
@@ -270,14 +329,18 @@ class _LawSearch:
         simulator, guess = self.simulator(zero), self.guess
         stiff = {"c10": guess["c10"], "bulk_1": min(guess["bulk_1"], 100.0 * guess["c10"])}
         for names in (self.train, self.validation):
-            motions = [self._motion(simulator, batch) for batch in self.motions.trials.batches(names)]
+            motions = [
+                self._motion(simulator, batch) for batch in self.motions.trials.batches(names)
+            ]
             forms.append(WeakForm(simulator, motions, zero, stiff, _STRIDE) if motions else None)
         assert forms[0] is not None
         return fit_classes(forms[0], forms[1], wanted.terms, times, wanted.families)
 
     def _motion(self, simulator: Simulator, names: Sequence[str]) -> KnownMotion:
         replay = self.motions.replay(simulator, names)
-        _, inputs, _ = replay.prepare({name: simulator.tensor([value]) for name, value in self.others.items()})
+        _, inputs, _ = replay.prepare(
+            {name: simulator.tensor([value]) for name, value in self.others.items()}
+        )
         start = self.motions.start(replay)
         return KnownMotion(replay.trials.observed.transpose(0, 1), start.state.v, inputs)
 
@@ -292,9 +355,10 @@ class _LawSearch:
         return best
 
     def _refine(self, law: LawClass, whole: bool = False) -> RefinedLaw:
-        """Returns a law that is refined through the simulator, with the other identified parameters.
+        """A law that is refined through the simulator, with the other identified parameters.
 
-        Where markers are seen, every class has viscosities; with whole states, only one with that group.
+        Where markers are seen, every class has viscosities; with whole states, only one with that
+        group.
 
         Args:
             law: first guess.
@@ -303,7 +367,8 @@ class _LawSearch:
         guess = dict(law.parameters)
         if not self.motions.sees_states or "viscosity" in law.groups:
             guess |= {name: guess.get(name, 0.0) for name in VISCOSITIES}
-        others, searched = self._bounds_of_others, [name for name in guess if not name.startswith(_FIXED)]
+        others = self._bounds_of_others
+        searched = [name for name in guess if not name.startswith(_FIXED)]
         bounds = {name: self._bounds(name, guess[name]) for name in searched} | others
 
         def begin(before: Identification | None) -> tuple[Simulator, dict[str, float]]:
@@ -316,9 +381,12 @@ class _LawSearch:
         found = self._search(key, bounds, begin, self.names(whole), limits)
         refined = {name: found.parameters.get(name, value) for name, value in guess.items()}
         names = strong_names(refined, self.shear)
-        kept, beside = {n: refined[old] for n, old in names.items()}, {n: found.parameters[n] for n in others}
+        kept = {n: refined[old] for n, old in names.items()}
+        beside = {n: found.parameters[n] for n in others}
         score = self.scores([kept], beside)[0]
-        return RefinedLaw(replace(law, parameters=kept), beside, {**names, **{n: n for n in others}}, found, score)
+        return RefinedLaw(
+            replace(law, parameters=kept), beside, {**names, **{n: n for n in others}}, found, score
+        )
 
     def _search(
         self,
@@ -333,8 +401,8 @@ class _LawSearch:
         Args:
             key: of the search.
             bounds: of the parameters.
-            begin: simulator and first guesses of a search, where they differ from the identified values, by the result
-                of the search before.
+            begin: simulator and first guesses of a search, where they differ from the identified
+                values, by the result of the search before.
             names: of the trials.
             limits: durations of these that are used [s]; the smallest counts.
         """
@@ -350,7 +418,9 @@ class _LawSearch:
 
         released = key != _BESIDE and RELEASED in map(self.motions.trials.begin_of, self.train)
         options = (wanted.max_evaluations, wanted.tolerance, self.kept, "identify_law", key)
-        return refined_searches(prepared, *options, labels=self.motions.labels, released=released)[-1]
+        return refined_searches(prepared, *options, labels=self.motions.labels, released=released)[
+            -1
+        ]
 
     @cached_property
     def _bounds_of_others(self) -> dict[str, Bounds]:
@@ -362,5 +432,9 @@ class _LawSearch:
         prior, modulus = None, self.ranges.get("youngs_modulus")
         if modulus is not None and modulus.prior is not None:
             share = self.guess["c10"] / self.known["youngs_modulus"]
-            prior = Prior(mean=share * modulus.prior.mean, deviation=share * modulus.prior.deviation)
-        return bounds_of_parameter(name, value, self.guess, 1.0 if self.motions.sees_states else _FURTHER, prior)
+            prior = Prior(
+                mean=share * modulus.prior.mean, deviation=share * modulus.prior.deviation
+            )
+        return bounds_of_parameter(
+            name, value, self.guess, 1.0 if self.motions.sees_states else _FURTHER, prior
+        )

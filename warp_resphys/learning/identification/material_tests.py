@@ -1,16 +1,20 @@
-"""Identification of an elastic law from tests of specimens: tension, compression, shear, indentation, relaxation.
+"""Identification of an elastic law from tests of specimens:
+tension, compression, shear, indentation, relaxation.
 
 The coefficients of the law, not negative, and unknown constants of each machine minimise
 
-    sum_t K_t / N_t sum_n ((P(x_n) + z - p_n) / (noise w_n))^2 + priors,     x = e - toe - compliance p
+    sum_t K_t / N_t sum_n ((P(x_n) + z - p_n) / (noise w_n))^2 + priors,
+    x = e - toe - compliance p
 
-over the N_t samples of test t, with the nominal stress P of the law, the measured stress p and strain e, the zero z of
-the load cell, the strain at which the specimen becomes taut, and the compliance of the machine, which a crosshead shows
-as strain of the specimen. Errors are relative: w is p, but at least a fiftieth of its largest value. As a curve is
-smooth, its samples count as K_t = 20 independent ones at most.
+over the N_t samples of test t, with the nominal stress P of the law, the measured stress p and
+strain e, the zero z of the load cell, the strain at which the specimen becomes taut, and the
+compliance of the machine, which a crosshead shows as strain of the specimen. Errors are relative: w
+is p, but at least a fiftieth of its largest value. As a curve is smooth, its samples count as
+K_t = 20 independent ones at most.
 
-Terms are chosen by what they predict: every class of laws is fitted to the lower part of the strains, and the smallest
-that predicts the upper part about as well as the best is fitted to all of them.
+Terms are chosen by what they predict: every class of laws is fitted to the lower part of the
+strains, and the smallest that predicts the upper part about as well as the best is fitted to all of
+them.
 """
 
 import math
@@ -24,7 +28,15 @@ import scipy.optimize
 
 from ...energies.catalogue import LawContent, LawTest, TriedClass, law_content
 from ...energies.convex_material import ConvexMaterial
-from ...energies.isochoric import KINDS, TERMS, bulk_of, path_of, shear_modulus, stress, stress_columns
+from ...energies.isochoric import (
+    KINDS,
+    TERMS,
+    bulk_of,
+    path_of,
+    shear_modulus,
+    stress,
+    stress_columns,
+)
 from ...fem.integration_points import LODE
 from ...io.arrays import BoolArray, Brief, FloatArray
 from ...io.errors import InputError, listed
@@ -62,10 +74,11 @@ class MeasuredLaw(Brief):
         deviation: standard deviations of the coefficients.
         machines: constants of the machines by test: zero [Pa], toe, compliance [1/Pa].
         errors: root mean squares of the relative errors by test, with these constants.
-        classes: classes that were tried, none for a law that was scaled; ``residual`` is their error in the lower part
-            of the strains, ``validation`` that in the upper part.
+        classes: classes that were tried, none for a law that was scaled; ``residual`` is their
+            error in the lower part of the strains, ``validation`` that in the upper part.
         groups: terms of the chosen one, besides c10.
-        stretches: least and largest principal stretch, of simulated specimens as if they deformed homogeneously.
+        stretches: least and largest principal stretch, of simulated specimens as if they deformed
+            homogeneously.
         modes: of loading of the specimens, see `fem.integration_points.LODE`.
         largest: largest strain of the tests.
         rates: least and largest rate of strain [1/s]; None without times.
@@ -87,27 +100,38 @@ class MeasuredLaw(Brief):
     covariance: FloatArray = field(repr=False)
 
     def away(self, name: str, test: MaterialTest) -> FloatArray:
-        """Returns the relative errors (N,) in a test, with the constants of the machine of the test of a name."""
+        """Returns the relative errors (N,) in a test,
+        with the constants of the machine of the test of a name.
+        """
         return test.away(self.columns, self.machines[name])
 
     @property
     def is_viscous(self) -> bool:
         """Whether stresses depend on the rate."""
-        return any(name.startswith(("prony", "shear_visc")) and value for name, value in self.columns.items())
+        return any(
+            name.startswith(("prony", "shear_visc")) and value
+            for name, value in self.columns.items()
+        )
 
     def curve(self, test: MaterialTest, strain: FloatArray) -> FloatArray:
-        """Returns the stress (N,) [Pa] at strains (N,) of a test's specimen: at its times, or in slow loading."""
+        """Returns the stress (N,) [Pa] at strains (N,) of a test's specimen:
+        at its times, or in slow loading.
+        """
         if test.specimen is None and test.seconds is None:
             return stress(test.kind, strain, self.parameters)
         return test.response(strain, self.columns)[0]
 
-    def interval(self, kind: str, strain: FloatArray, beyond: float = BEYOND) -> tuple[FloatArray, FloatArray]:
-        """Returns the nominal stress (N,) in slow loading, and the half-width (N,) of its 90 % interval [Pa].
+    def interval(
+        self, kind: str, strain: FloatArray, beyond: float = BEYOND
+    ) -> tuple[FloatArray, FloatArray]:
+        """Returns the nominal stress (N,) in slow loading,
+        and the half-width (N,) of its 90 % interval [Pa].
 
-        In the range of the tests the interval covers the posterior of the coefficients and the misfit of the law.
-        Beyond, laws err in ways that no test within the range shows: over 19 silicones of a public database, and tests
-        up to 50 to 200 % of strain, about nine of ten errors up to twice that strain were below 0.25 log2 of the ratio
-        of strains, which is ``beyond`` (docs/results/silicones.md).
+        In the range of the tests the interval covers the posterior of the coefficients and the
+        misfit of the law. Beyond, laws err in ways that no test within the range shows: over 19
+        silicones of a public database, and tests up to 50 to 200 % of strain, about nine of ten
+        errors up to twice that strain were below 0.25 log2 of the ratio of strains, which is
+        ``beyond`` (docs/results/silicones.md).
         """
         columns = stress_columns(kind, strain, tuple(self.deviation))
         slopes = np.stack([*columns.values()], 1)
@@ -115,7 +139,9 @@ class MeasuredLaw(Brief):
         ratio = np.maximum(np.abs(strain) / self.largest, 1.0)
         known = np.einsum("np,pq,nq->n", slopes, self.covariance, slopes)
         misfit = _QUANTILE * max(self.errors.values()) * value
-        return value, np.sqrt(_QUANTILE**2 * known + misfit**2 + (beyond * np.log2(ratio) * value) ** 2)
+        return value, np.sqrt(
+            _QUANTILE**2 * known + misfit**2 + (beyond * np.log2(ratio) * value) ** 2
+        )
 
     @property
     def shear_deviation(self) -> float:
@@ -160,10 +186,12 @@ def identify_from_tests(
         tests: tests by name.
         density: of the material [kg/m^3].
         poissons_ratio: of the material at small strains, which these tests hardly show.
-        terms: elastic terms that are tried beside c10, two at most in a law, named as in `ConvexMaterial`.
+        terms: elastic terms that are tried beside c10, two at most in a law, named as in
+            `ConvexMaterial`.
         times: relaxation times of the branches that are tried [s]; none for slow tests.
-        known: law of the same material from another source. Its shear modulus at small strains is a prior, with its
-            standard deviation (``shear_deviation``, or 5 %), and its viscosity and branches are part of the law.
+        known: law of the same material from another source. Its shear modulus at small strains is a
+            prior, with its standard deviation (``shear_deviation``, or 5 %), and its viscosity and
+            branches are part of the law.
 
     Raises:
         InputError: no test, branches without times, or a shear modulus that no elastomer has.
@@ -171,16 +199,25 @@ def identify_from_tests(
     """
     if not tests:
         raise InputError("tests is empty: give one test or more.")
-    search = _Search(tests, density, poissons_ratio, tuple(f"prony_{float(time)!r}" for time in times), known)
+    search = _Search(
+        tests, density, poissons_ratio, tuple(f"prony_{float(time)!r}" for time in times), known
+    )
     if unknown := [term for term in terms if not TERMS.fullmatch(term) or term == "c10"]:
-        raise InputError(f"terms has {unknown[0]!r}: choose from c20, c30, c01, c02, and ogden_3, ogden_m3 and so on.")
-    if not 0.0 < poissons_ratio < 0.5:
-        raise InputError(f"poissons_ratio is {poissons_ratio:g}: give one between 0 and 0.5, such as 0.4995.")
-    late = [name for name, test in tests.items() if test.seconds is None and test.specimen is None]
-    if (times or search.viscous) and (late or all(test.specimen is not None for test in tests.values())):
         raise InputError(
-            f"{listed(late or [*tests])}: times of a homogeneous test are missing, which relaxing branches need: give "
-            "them, or no branches."
+            f"terms has {unknown[0]!r}: choose from c20, c30, "
+            "c01, c02, and ogden_3, ogden_m3 and so on."
+        )
+    if not 0.0 < poissons_ratio < 0.5:
+        raise InputError(
+            f"poissons_ratio is {poissons_ratio:g}: give one between 0 and 0.5, such as 0.4995."
+        )
+    late = [name for name, test in tests.items() if test.seconds is None and test.specimen is None]
+    if (times or search.viscous) and (
+        late or all(test.specimen is not None for test in tests.values())
+    ):
+        raise InputError(
+            f"{listed(late or [*tests])}: times of a homogeneous test are missing, which "
+            "relaxing branches need: give them, or no branches."
         )
     for name, test in tests.items():
         test.check(name)
@@ -191,9 +228,17 @@ def identify_from_tests(
         upper = [test.used & ~rows for test, rows in zip(tests.values(), lower, strict=True)]
         errors = [fit.error(lower), fit.error(upper)]
         parameters = search.parameters(fit)
-        classes.append(TriedClass(groups=[*chosen], parameters=parameters, residual=errors[0], validation=errors[1]))
+        classes.append(
+            TriedClass(
+                groups=[*chosen], parameters=parameters, residual=errors[0], validation=errors[1]
+            )
+        )
     errors_beyond = [float(one["validation"] or 0.0) for one in classes]
-    best = next(k for k, error in enumerate(errors_beyond) if error <= max(_CLOSE * min(errors_beyond), _EXACT))
+    best = next(
+        k
+        for k, error in enumerate(errors_beyond)
+        if error <= max(_CLOSE * min(errors_beyond), _EXACT)
+    )
     return search.law(search.fit(groups[best]), classes, best)
 
 
@@ -209,7 +254,10 @@ class _Fit:
 
     def error(self, rows: Sequence[BoolArray] | None = None) -> float:
         """Root mean square of the relative errors in some samples of the tests."""
-        away = [test.away(self.law, machine) for test, machine in zip(self.tests, self.machines, strict=True)]
+        away = [
+            test.away(self.law, machine)
+            for test, machine in zip(self.tests, self.machines, strict=True)
+        ]
         counted = [test.used for test in self.tests] if rows is None else rows
         chosen = [one[of] for one, of in zip(away, counted, strict=True) if of.any()]
         return math.sqrt(float(np.mean([np.square(one).mean() for one in chosen])))
@@ -231,7 +279,9 @@ class _Search:
         given: Mapping[str, float] = {} if self.known is None else self.known["parameters"]
         found = {name: value for name, value in given.items() if name == "shear_viscosity"}
         times = {
-            name: f"prony_{float(given[name.replace('modulus', 'time')])!r}" for name in given if "prony_mod" in name
+            name: f"prony_{float(given[name.replace('modulus', 'time')])!r}"
+            for name in given
+            if "prony_mod" in name
         }
         return found | {column: given[name] for name, column in times.items()}
 
@@ -243,11 +293,21 @@ class _Search:
             rows: samples of each test; all if None.
         """
         tests, names = [*self.tests.values()], ("c10", *terms, *self.branches)
-        unit = max(float(np.abs(test.stress[test.used]).max() / np.abs(test.strain[test.used]).max()) for test in tests)
-        of_machines = [(number, name) for number, test in enumerate(tests) for name in test.deviations]
-        scales = np.array([unit] * len(names) + [tests[number].deviations[name] for number, name in of_machines])
+        unit = max(
+            float(np.abs(test.stress[test.used]).max() / np.abs(test.strain[test.used]).max())
+            for test in tests
+        )
+        of_machines = [
+            (number, name) for number, test in enumerate(tests) for name in test.deviations
+        ]
+        scales = np.array(
+            [unit] * len(names) + [tests[number].deviations[name] for number, name in of_machines]
+        )
         system = _System(self, tests, names, of_machines, scales, rows)
-        ends = np.array([0.0] * len(names) + [-_MOST] * len(of_machines)), np.full(len(scales), _MOST)
+        ends = (
+            np.array([0.0] * len(names) + [-_MOST] * len(of_machines)),
+            np.full(len(scales), _MOST),
+        )
         ends[1][: len(names)] = np.inf
         x = np.zeros(len(scales))
         x[0] = 0.2
@@ -267,11 +327,18 @@ class _Search:
 
     def parameters(self, fit: _Fit) -> dict[str, float]:
         """Parameters of a `ConvexMaterial`."""
-        shear, elastic = shear_modulus(fit.coefficients), [name for name in fit.coefficients if TERMS.fullmatch(name)]
-        kept = {n: x for n in elastic if (x := fit.coefficients[n]) > _NEEDLESS * shear or n == "c10"}
-        branches = {n: x for n, x in fit.law.items() if n.startswith("prony_") and x > _NEEDLESS * shear}
+        shear = shear_modulus(fit.coefficients)
+        elastic = [name for name in fit.coefficients if TERMS.fullmatch(name)]
+        kept = {
+            n: x for n in elastic if (x := fit.coefficients[n]) > _NEEDLESS * shear or n == "c10"
+        }
+        branches = {
+            n: x for n, x in fit.law.items() if n.startswith("prony_") and x > _NEEDLESS * shear
+        }
         viscosity = {name: value for name, value in fit.law.items() if name == "shear_viscosity"}
-        relaxing = branches_of([*branches.values()], [float(name.removeprefix("prony_")) for name in branches])
+        relaxing = branches_of(
+            [*branches.values()], [float(name.removeprefix("prony_")) for name in branches]
+        )
         return {
             "density": self.density,
             **kept,
@@ -287,27 +354,44 @@ class _Search:
             InputError: no elastic term resists.
         """
         if not shear_modulus(fit.coefficients) > 0.0:
-            raise InputError("no elastic term explains these stresses: check the signs and the columns of the tests.")
+            raise InputError(
+                "no elastic term explains these stresses: "
+                "check the signs and the columns of the tests."
+            )
         parameters, tests = self.parameters(fit), [*self.tests.values()]
         kept = [k for k, name in enumerate(fit.coefficients) if name in parameters]
         names = [name for name in fit.coefficients if name in parameters]
         covariance = fit.covariance[np.ix_(kept, kept)]
-        away = [test.away(fit.law, machine)[test.used] for test, machine in zip(tests, fit.machines, strict=True)]
+        away = [
+            test.away(fit.law, machine)[test.used]
+            for test, machine in zip(tests, fit.machines, strict=True)
+        ]
         strains = [np.append(test.strain[test.used], 0.0) for test in tests]
         kinds = [test.kind if test.kind in KINDS else "compression" for test in tests]
-        stretches = [path_of(kind, strain).stretches for kind, strain in zip(kinds, strains, strict=True)]
-        rates = [np.abs(np.diff(test.strain) / np.diff(test.seconds)) for test in tests if test.seconds is not None]
+        stretches = [
+            path_of(kind, strain).stretches for kind, strain in zip(kinds, strains, strict=True)
+        ]
+        rates = [
+            np.abs(np.diff(test.strain) / np.diff(test.seconds))
+            for test in tests
+            if test.seconds is not None
+        ]
         return MeasuredLaw(
             parameters=parameters,
             deviation=dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
             machines=dict(zip(self.tests, fit.machines, strict=True)),
-            errors={name: math.sqrt(float(np.square(one).mean())) for name, one in zip(self.tests, away, strict=True)},
+            errors={
+                name: math.sqrt(float(np.square(one).mean()))
+                for name, one in zip(self.tests, away, strict=True)
+            },
             classes=classes,
             groups=classes[best]["groups"],
             stretches=(float(min(map(np.min, stretches))), float(max(map(np.max, stretches)))),
             modes=[mode for mode in LODE if mode in {_MODES[kind] for kind in kinds}],
             largest=max(float(np.abs(strain).max()) for strain in strains),
-            rates=(float(min(map(np.median, rates))), float(max(map(np.median, rates)))) if rates else None,
+            rates=(float(min(map(np.median, rates))), float(max(map(np.median, rates))))
+            if rates
+            else None,
             columns=fit.law,
             covariance=covariance,
         )
@@ -315,7 +399,9 @@ class _Search:
 
 @dataclass(frozen=True)
 class _System:
-    """Weighted residuals of a class of laws, and their derivatives by scaled coefficients and machines' constants."""
+    """Weighted residuals of a class of laws, and their derivatives
+    by scaled coefficients and machines' constants.
+    """
 
     search: _Search
     tests: Sequence[MaterialTest]
@@ -324,7 +410,9 @@ class _System:
     scales: FloatArray
     rows: Sequence[BoolArray] | None
 
-    def unpacked(self, x: FloatArray) -> tuple[dict[str, float], dict[str, float], list[dict[str, float]]]:
+    def unpacked(
+        self, x: FloatArray
+    ) -> tuple[dict[str, float], dict[str, float], list[dict[str, float]]]:
         """Returns the coefficients, the whole law, and the constants of the machines."""
         values, count = (x * self.scales).tolist(), len(self.names)
         coefficients = dict(zip(self.names, values[:count], strict=True))
@@ -334,7 +422,11 @@ class _System:
         law, viscous = dict(coefficients), self.search.viscous
         for name, value in viscous.items():
             law[name] = law.get(name, 0.0) + value
-        return coefficients, law | {"bulk_1": bulk_of(coefficients, self.search.poissons_ratio)}, machines
+        return (
+            coefficients,
+            law | {"bulk_1": bulk_of(coefficients, self.search.poissons_ratio)},
+            machines,
+        )
 
     def linear(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Returns residuals (R,) and derivatives (R, P) by x (P,)."""
@@ -343,7 +435,11 @@ class _System:
         for number, (test, machine) in enumerate(zip(self.tests, machines, strict=True)):
             value, by_law, by_strain = test.response(test.taut(machine), law)
             zero = np.zeros_like(value)
-            by_machine = {"zero": zero + 1.0, "toe": -by_strain, "compliance": -by_strain * test.stress}
+            by_machine = {
+                "zero": zero + 1.0,
+                "toe": -by_strain,
+                "compliance": -by_strain * test.stress,
+            }
             columns = [by_law[name] for name in self.names]
             columns += [by_machine[name] if at == number else zero for at, name in self.of_machines]
             chosen = test.used if self.rows is None else self.rows[number]
@@ -353,7 +449,9 @@ class _System:
         residuals.append(x[len(self.names) :])
         slopes.append(np.eye(len(x))[len(self.names) :])
         if (known := self.search.known) is not None:
-            shares = np.array([shear_modulus({name: 1.0}) for name in self.names] + [0.0] * len(self.of_machines))
+            shares = np.array(
+                [shear_modulus({name: 1.0}) for name in self.names] + [0.0] * len(self.of_machines)
+            )
             modulus = shear_modulus(known["parameters"])
             deviation = known.get("shear_deviation") or _RELATIVE_DEVIATION * modulus
             row = shares * self.scales / deviation
@@ -362,7 +460,7 @@ class _System:
         return np.concatenate(residuals), np.concatenate(slopes)
 
     def fit(self, x: FloatArray, residual: FloatArray, slopes: FloatArray) -> _Fit:
-        """Returns the fit at the minimum, with the covariance of the coefficients that are not zero."""
+        """Returns the fit at the minimum, with the covariance of coefficients that are not zero."""
         count, free = len(self.names), x > 1e-12
         free[len(self.names) :] = True
         curvature = slopes[:, free].T @ slopes[:, free]

@@ -1,12 +1,15 @@
-"""The misfit of a simulator to observed motions, as a function of the physical parameters to identify.
+"""The misfit of a simulator to observed motions, as a function
+of the physical parameters to identify.
 
-The loss is the mean square distance of simulated and observed markers, each motion in units of its own amplitude, over
-all motions at once. Prior knowledge is that of the parameters (`parameters.Prior`) and of marker places (`placement`).
-It adds its squares, weighted as much as one independent residual of the data: by their mean square, times the number of
-residuals that are correlated. That weight is computed at the start of a search and again where the loss hardly falls.
+The loss is the mean square distance of simulated and observed markers, each motion in units of its
+own amplitude, over all motions at once. Prior knowledge is that of the parameters
+(`parameters.Prior`) and of marker places (`placement`). It adds its squares, weighted as much as
+one independent residual of the data: by their mean square, times the number of residuals that are
+correlated. That weight is computed at the start of a search and again where the loss hardly falls.
 
-A parameter may have a value for each trial or session (`parameters.value_name`), held by its prior; all others have the
-mean of the prior. A trial depends on its own value alone, so that one motion gives the derivatives of all trials.
+A parameter may have a value for each trial or session (`parameters.value_name`), held by its prior;
+all others have the mean of the prior. A trial depends on its own value alone, so that one motion
+gives the derivatives of all trials.
 """
 
 import math
@@ -36,7 +39,9 @@ from .nuisances import NuisanceFit, Nuisances
 from .uncertainty import LinearMisfit, LinearTrial, Uncertainty, left_out, uncertainty_of
 
 _LEAST_WEIGHT = 1e-18  # of the priors, where the residuals are rounding
-_MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
+_MOST_ITERATIONS = (
+    200  # of a solve; steps take a handful, and parameters that need more have failed
+)
 _DIFFERENCE = 1e-5  # of a parameter, for derivatives, as a fraction of its range
 _MOST_BYTES = 2**30  # of the states, and of the derivatives, that are kept
 
@@ -49,7 +54,8 @@ class BoundedMisfit(ABC):
 
     Attributes:
         bounds: see above.
-        prior_weight: mean square of one independent residual, which weights the priors; 0 before it is computed.
+        prior_weight: mean square of one independent residual, which weights the priors; 0 before it
+            is computed.
         failure: message of the last simulation that failed.
     """
 
@@ -69,10 +75,15 @@ class BoundedMisfit(ABC):
             derivatives: whether to compute derivatives; they are zero otherwise.
         """
 
-    def objective(self, unit: FloatArray, derivatives: bool) -> tuple[float, FloatArray, FloatArray]:
-        """Returns the loss, its gradient (P,) and Gauss-Newton matrix (P, P), for `linalg.least_squares.UnitBox`."""
+    def objective(
+        self, unit: FloatArray, derivatives: bool
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """Returns the loss, its gradient (P,) and Gauss-Newton matrix (P, P), for
+        `linalg.least_squares.UnitBox`.
+        """
         count = len(unit)
-        linear, slopes = self.linearise(unit, derivatives), (np.zeros(count), np.zeros((count, count)))
+        linear = self.linearise(unit, derivatives)
+        slopes = (np.zeros(count), np.zeros((count, count)))
         if linear is None or not math.isfinite(linear.loss):
             return math.inf, *slopes
         slopes = (linear.gradient, linear.gauss_newton) if derivatives else slopes
@@ -104,7 +115,10 @@ class BoundedMisfit(ABC):
         }
 
     def losses_or_infinite(self, points: FloatArray) -> FloatArray:
-        """(E,) losses of (E, P) parameters, each as if it were the first; infinite where the simulation fails."""
+        """(E,) losses of (E, P) parameters, each as if it were the first.
+
+        Infinite where the simulation fails.
+        """
         losses = np.full(len(points), np.inf)
         for number, point in enumerate(points):
             self.forget()
@@ -113,7 +127,9 @@ class BoundedMisfit(ABC):
         return losses
 
     def prior_rows(self, unit: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        """(K,) weighted residuals of the priors of parameters, their derivatives (K, P), and their weight."""
+        """(K,) weighted residuals of the priors of parameters,
+        their derivatives (K, P), and their weight.
+        """
         rows, slopes = np.zeros(len(self._priors)), np.zeros((len(self._priors), len(unit)))
         weight = math.sqrt(self.prior_weight)
         for row, (i, mean, deviation) in enumerate(self._priors):
@@ -126,7 +142,9 @@ class BoundedMisfit(ABC):
         if linearised is None:
             return
         seen = sum(trial.seen for trial in linearised.trials)
-        squares = [np.square(trial.rows).sum() * redundancy(trial.rows) for trial in linearised.trials]
+        squares = [
+            np.square(trial.rows).sum() * redundancy(trial.rows) for trial in linearised.trials
+        ]
         self.prior_weight = max(float(sum(squares)) / max(seen, 1), _LEAST_WEIGHT)
 
     def uncertainty(self, unit: FloatArray) -> Uncertainty | None:
@@ -139,15 +157,18 @@ class Misfit(BoundedMisfit):
     """Loss, residuals and their derivatives.
 
     Args:
-        replays: groups of trials that begin alike, such as motions or static poses, with their starts; all with one
-            simulator.
+        replays: groups of trials that begin alike, such as motions or static poses, with their
+            starts; all with one simulator.
         bounds: range of each of the P parameters to identify.
         seconds: length of each motion that is compared [s]; the whole motion if None.
-        accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
-        known: values of further parameters, which are not identified; residuals are lengths then, as amplitudes would
-            be those of the whole motions.
-        delay: standard deviation of the delay of motions that their inputs begin [s]; see `nuisances.NuisanceFit`.
-        shares: (M,) of the coordinates of each observed point that are independent of the others; None: all.
+        accuracy: standard deviations of the marker places and of the recording's frame; None: both
+            are exact.
+        known: values of further parameters, which are not identified; residuals are lengths then,
+            as amplitudes would be those of the whole motions.
+        delay: standard deviation of the delay of motions that their inputs begin [s]; see
+            `nuisances.NuisanceFit`.
+        shares: (M,) of the coordinates of each observed point that are independent of the others;
+            None: all.
 
     Attributes:
         simulator: of all replays; it raises where a solve fails.
@@ -167,7 +188,9 @@ class Misfit(BoundedMisfit):
         shares: Sequence[float] | None = None,
     ) -> None:
         if not bounds:
-            raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
+            raise InputError(
+                "there is nothing to identify: name a parameter under identify.parameters."
+            )
         first = replays[0][0]
         check_names(bounds, first.parameter_names)
         super().__init__(bounds)
@@ -186,7 +209,11 @@ class Misfit(BoundedMisfit):
                 if not moved > 0.0:
                     still = "markers" if trials.observed.shape[2] else "forces"
                     stay = "stay where they were held" if trials.observed.shape[2] else "are zero"
-                    stay += ", and its forces are zero" if trials.sensors and trials.observed.shape[2] else ""
+                    stay += (
+                        ", and its forces are zero"
+                        if trials.sensors and trials.observed.shape[2]
+                        else ""
+                    )
                     raise InputError(f"the {still} of the trial {name!r} {stay}: leave it out.")
             pair = replay.changed(simulator=self.simulator, trials=trials), start
             self._replays.append(pair if accuracy is None else DisplacedMarkers.replay(*pair))
@@ -198,7 +225,9 @@ class Misfit(BoundedMisfit):
     @override
     def forget(self) -> None:
         """Forgets motions with earlier parameters, from which the next ones are predicted."""
-        self._motions = [NearbyMotion(self.simulator.tensor(self._owners(r.trials))) for r, _ in self._replays]
+        self._motions = [
+            NearbyMotion(self.simulator.tensor(self._owners(r.trials))) for r, _ in self._replays
+        ]
         self._last: tuple[torch.Tensor, list[Sensed]] | None = None  # of `_followed`
 
     @override
@@ -211,14 +240,16 @@ class Misfit(BoundedMisfit):
     def uncertainty(self, unit: FloatArray) -> Uncertainty | None:
         """Uncertainty of (P,) parameters, see `left_out`; None if a simulation close by fails.
 
-        Equilibria that are solved again with other parameters (`EnergySet.follow_pose`) are solved exactly if that
-        converges.
+        Equilibria that are solved again with other parameters (`EnergySet.follow_pose`) are solved
+        exactly if that converges.
         """
         system = None
         if self.simulator.energies.follow_pose:
             accurate = copy(self)
             accurate.simulator = exact(self.simulator)
-            accurate._replays = [(r.changed(simulator=accurate.simulator), start) for r, start in self._replays]
+            accurate._replays = [
+                (r.changed(simulator=accurate.simulator), start) for r, start in self._replays
+            ]
             accurate.forget()
             system = accurate._system(unit)
         system = system or self._system(unit)
@@ -230,11 +261,14 @@ class Misfit(BoundedMisfit):
     def _system(self, unit: FloatArray, derivatives: bool = True) -> LinearMisfit | None:
         """Linearises the residuals at constant marker places and delays.
 
-        Derivatives are differences of motions of nearly the same parameters (`Replay.varied`), into the range.
+        Derivatives are differences of motions of nearly the same parameters (`Replay.varied`), into
+        the range.
         """
         steps = _DIFFERENCE * np.where(unit < 0.5, 1.0, -1.0)
         moves = self._moves if derivatives else []
-        moved = np.array([np.isin(np.arange(len(unit)), columns) * steps for columns in moves]).reshape(-1, len(unit))
+        moved = np.array(
+            [np.isin(np.arange(len(unit)), columns) * steps for columns in moves]
+        ).reshape(-1, len(unit))
         points = self.simulator.tensor(np.concatenate([unit[None], unit + moved]))
         try:
             with torch.no_grad():
@@ -246,27 +280,40 @@ class Misfit(BoundedMisfit):
         trials = list[LinearTrial]()
         for number, (errors, weight) in enumerate(zip(fitted, self._weights, strict=True)):
             observed = self._replays[number][0].trials
-            weighted = (errors * weight.sqrt()[:, None, None]).double().cpu().numpy()  # (E, R, T, C)
+            # (E, R, T, C)
+            weighted = (errors * weight.sqrt()[:, None, None]).double().cpu().numpy()
             flat = weighted.reshape(*weighted.shape[:2], -1)
             slopes = np.zeros((*flat.shape[1:], len(unit)))  # (R, T C, P)
-            for changed, columns, owners in zip(flat[1:], self._moves, self._owners(observed), strict=derivatives):
-                slopes[..., columns] = (changed - flat[0])[..., None] * (owners[:, columns] / steps[columns])[:, None]
-            follow = nuisances.columns[number] if nuisances.columns else np.zeros((*slopes.shape[:2], 0))
+            for changed, columns, owners in zip(
+                flat[1:], self._moves, self._owners(observed), strict=derivatives
+            ):
+                slopes[..., columns] = (changed - flat[0])[..., None] * (
+                    owners[:, columns] / steps[columns]
+                )[:, None]
+            follow = (
+                nuisances.columns[number] if nuisances.columns else np.zeros((*slopes.shape[:2], 0))
+            )
             shown = observed.seen.sum(1).cpu().numpy()  # (R, M) frames
             shown = shown if self._shares is None else self._shares * shown
             seen = observed.observed.shape[-1] * shown.sum(1)
             seen = (seen + observed.readings.cpu().numpy()).tolist()
             of_trials = zip(weighted[0], slopes, seen, observed.names, follow, strict=True)
-            trials += [LinearTrial(r, s, n, name, observed.session, c) for r, s, n, name, c in of_trials]
+            trials += [
+                LinearTrial(r, s, n, name, observed.session, c) for r, s, n, name, c in of_trials
+            ]
         return LinearMisfit(trials, *self.prior_rows(unit), nuisances)
 
     def _owners(self, trials: TrialBatch) -> FloatArray:
         """(S, R, P) one where a motion of `_moves_of` changes a parameter of a trial, else zero."""
         owners = np.zeros((len(self._moves), len(trials.names), len(self.bounds)))
         names = [split_name(name)[1] for name in self.bounds]
-        for number, column in ((number, column) for number, moved in enumerate(self._moves) for column in moved):
+        for number, column in (
+            (number, column) for number, moved in enumerate(self._moves) for column in moved
+        ):
             owner = names[column]
-            owners[number, :, column] = [not owner or owner in (t, trials.session) for t in trials.names]
+            owners[number, :, column] = [
+                not owner or owner in (t, trials.session) for t in trials.names
+            ]
         return owners
 
     @property
@@ -277,22 +324,38 @@ class Misfit(BoundedMisfit):
     @override
     def nuisances(self, unit: FloatArray) -> Nuisances:
         with torch.no_grad():
-            return self._fit(self._followed(self.simulator.tensor(unit)[None]), self.prior_weight)[1]
+            return self._fit(self._followed(self.simulator.tensor(unit)[None]), self.prior_weight)[
+                1
+            ]
 
     def _values(self, unit: torch.Tensor) -> dict[str, torch.Tensor]:
-        """(E,) values of each parameter; where trials have their own, the common one is the mean of the prior."""
-        values = {name: range_.from_unit(unit[:, i]) for i, (name, range_) in enumerate(self.bounds.items())}
-        common = {split_name(name)[0]: range_ for name, range_ in self.bounds.items() if split_name(name)[1]}
-        others = {name: range_.prior.mean for name, range_ in common.items() if range_.prior is not None} | self._known
+        """(E,) values of each parameter.
+
+        Where trials have their own, the common one is the mean of the prior.
+        """
+        values = {
+            name: range_.from_unit(unit[:, i])
+            for i, (name, range_) in enumerate(self.bounds.items())
+        }
+        common = {
+            split_name(name)[0]: range_
+            for name, range_ in self.bounds.items()
+            if split_name(name)[1]
+        }
+        others = {
+            name: range_.prior.mean for name, range_ in common.items() if range_.prior is not None
+        } | self._known
         return {name: torch.full_like(unit[:, 0], value) for name, value in others.items()} | values
 
     def _followed(self, points: torch.Tensor) -> list[Sensed]:
-        """Simulated points and readings of each replay (`Replay.sensed`), predicted from those with earlier parameters.
+        """Simulated points and readings of each replay (`Replay.sensed`),
+        predicted from those with earlier parameters.
 
         The first motion is not simulated again where the last one had its parameters.
 
         Args:
-            points: (1, P) parameters, or further rows that change them along each direction of the derivatives.
+            points: (1, P) parameters, or further rows that change them along each direction of the
+                derivatives.
         """
         if self._last is not None and torch.equal(self._last[0], points):
             return self._last[1]
@@ -321,13 +384,15 @@ class Misfit(BoundedMisfit):
 class NearbyMotion:
     """The last motion of R trials, and the last derivatives of its positions by P parameters.
 
-    A search for parameters simulates nearly the same motion again and again. Its prediction to first order, q(p) =
-    q(p0) + dq/dp (p - p0), is where the solver of an equilibrium or a step starts (`Simulator.step`): the error is of
-    second order in the change of the parameters, and smooth in time, so that the solver extrapolates it from step to
-    step. States are kept, so that derivatives can be computed after a simulation.
+    A search for parameters simulates nearly the same motion again and again. Its prediction to
+    first order, q(p) = q(p0) + dq/dp (p - p0), is where the solver of an equilibrium or a step
+    starts (`Simulator.step`): the error is of second order in the change of the parameters, and
+    smooth in time, so that the solver extrapolates it from step to step. States are kept, so that
+    derivatives can be computed after a simulation.
 
     Args:
-        owners: (S, R, P) one where a direction of the derivatives changes a parameter of a trial, else zero.
+        owners: (S, R, P) one where a direction of the derivatives changes a parameter of a trial,
+            else zero.
     """
 
     def __init__(self, owners: torch.Tensor) -> None:
@@ -344,12 +409,19 @@ class NearbyMotion:
         self._unit, self._states, self._count = unit, states if small else states[:1], len(states)
 
     def states(self, unit: torch.Tensor) -> Sequence[State] | None:
-        """Returns the states with parameters (P,), if the last motion had these and they are kept."""
+        """Returns states with parameters (P,), if the last motion had these and they are kept."""
         whole = len(self._states) == self._count > 0
-        return self._states if whole and self._unit is not None and torch.equal(unit, self._unit) else None
+        return (
+            self._states
+            if whole and self._unit is not None and torch.equal(unit, self._unit)
+            else None
+        )
 
     def predict(self, unit: torch.Tensor, number: int) -> torch.Tensor | None:
-        """Returns positions (R, N, 3) of a state with parameters (P,) [m]; None where nothing predicts them."""
+        """Returns positions (R, N, 3) of a state with parameters (P,) [m].
+
+        None where nothing predicts them.
+        """
         if self._unit is None or number >= len(self._states):
             return None
         q = self._states[number].q
@@ -360,12 +432,15 @@ class NearbyMotion:
         return q if bool(q.isfinite().all()) else None
 
     def differentiate(self, points: torch.Tensor) -> None:
-        """Begins derivatives by parameters (1 + S, P): those of the motion, and those changed along each direction."""
+        """Begins derivatives by parameters (1 + S, P): those of the motion,
+        and those changed along each direction.
+        """
         steps = torch.einsum("srp,sp->sr", self._owners, points[1:] - points[0])
         self._steps, self._slopes = torch.where(steps == 0.0, torch.inf, steps)[..., None, None], []
 
     def record(self, q: torch.Tensor, others: torch.Tensor) -> None:
-        """Keeps the derivatives of the next state, unless a long motion of a large body needs too much memory.
+        """Keeps the derivatives of the next state, unless a long motion
+        of a large body needs too much memory.
 
         Args:
             q: (R, N, 3) positions [m].
@@ -385,7 +460,9 @@ def _parts(replay: Replay, start: Start) -> list[tuple[Replay, Start]]:
 
 
 def _moves_of(names: Iterable[str]) -> list[list[int]]:
-    """Indices of the parameters that one motion gives the derivatives by: all values of trials of a parameter."""
+    """Indices of the parameters that one motion gives the derivatives by:
+    all values of trials of a parameter.
+    """
     moves: dict[str, list[int]] = {}
     for number, name in enumerate(names):
         parameter, owner = split_name(name)

@@ -1,9 +1,11 @@
-"""Marker places and delays of trials that fit best for each set of physical parameters (variable projection).
+"""Marker places and delays of trials that fit best for each set
+of physical parameters (variable projection).
 
-Both are nuisance parameters with a normal prior around zero: the marker places of `placement`, and the time by which
-the inputs of each trial act later than recorded, as clocks differ, frames are lost, and a valve opens when it likes. A
-delay moves a motion in time, so that it needs no simulation of its own. For each set of physical parameters, they take
-the values with the least sum of squares, prior included (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413).
+Both are nuisance parameters with a normal prior around zero: the marker places of `placement`, and
+the time by which the inputs of each trial act later than recorded, as clocks differ, frames are
+lost, and a valve opens when it likes. A delay moves a motion in time, so that it needs no
+simulation of its own. For each set of physical parameters, they take the values with the least sum
+of squares, prior included (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413).
 """
 
 import math
@@ -19,8 +21,10 @@ from ..placement import Accuracy, Placement, PlainPlacements, by_placement
 from ..replay import Replay, Sensed
 from ..start import Start
 
-_FURTHEST, _TRIED = 3.0, 61  # largest delay, in expected deviations, and number of delays from which the search begins
-_TURNS, _STEPS = 4, 6  # Gauss-Newton steps of places, as rotations by a few degrees are nearly linear; with delays
+# Largest delay, in expected deviations, and number of delays from which the search begins.
+_FURTHEST, _TRIED = 3.0, 61
+# Gauss-Newton steps of places, as rotations by a few degrees are nearly linear; with delays
+_TURNS, _STEPS = 4, 6
 _LONGEST = 0.5  # change of a delay in a step, in expected deviations
 _DIFFERENCE = 1e-2  # of the time between frames, for the derivative by a delay
 
@@ -30,12 +34,13 @@ class Nuisances:
     """The best places and delays for one set of parameters.
 
     Attributes:
-        columns: (R, D, K) derivatives of the weighted residuals of each group, in standard deviations of the prior;
-            empty if nothing was fitted.
+        columns: (R, D, K) derivatives of the weighted residuals of each group, in standard
+            deviations of the prior; empty if nothing was fitted.
         rows: (K,) weighted residuals of the prior.
         sessions: placement of the markers in each session; empty if it is exact.
         common: placement in a session that is not known.
-        moves: (3 M + 6, k) change of the offsets, the shift and the turn of a session by the first k nuisances.
+        moves: (3 M + 6, k) change of the offsets, the shift and the turn of a session by the first
+            k nuisances.
     """
 
     columns: Sequence[FloatArray] = ()
@@ -45,11 +50,18 @@ class Nuisances:
     moves: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def plain(self, labels: Sequence[str]) -> PlainPlacements | None:
-        """Returns the placements as JSON data: the common one, and those of the named `sessions`; None without any."""
+        """Returns the placements as JSON data: the common one, and those of the named `sessions`.
+
+        None without any.
+        """
         if self.common is None:
             return None
         placements: PlainPlacements = {**self.common.plain(labels)}
-        if named := {session: placement.plain(labels) for session, placement in self.sessions.items() if session}:
+        if named := {
+            session: placement.plain(labels)
+            for session, placement in self.sessions.items()
+            if session
+        }:
             placements["sessions"] = named
         return placements
 
@@ -57,14 +69,17 @@ class Nuisances:
 class NuisanceFit:
     """Fits places and delays to simulated points, by Gauss-Newton.
 
-    The unknowns are in standard deviations of the prior: the common placement; what each session's differs from it by,
-    if there are several; and the delays of trials whose motion inputs begin, with those of their starts.
+    The unknowns are in standard deviations of the prior: the common placement; what each session's
+    differs from it by, if there are several; and the delays of trials whose motion inputs begin,
+    with those of their starts.
 
     Args:
         replays: groups of trials, whose points are `DisplacedMarkers` where places are uncertain.
         weights: (R,) of each trial's squared errors [1/m^2], by group.
-        accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
-        delay: standard deviation of the delay of motions that inputs begin [s]; zero: they have that of their start.
+        accuracy: standard deviations of the marker places and of the recording's frame; None: both
+            are exact.
+        delay: standard deviation of the delay of motions that inputs begin [s]; zero: they have
+            that of their start.
     """
 
     def __init__(
@@ -100,13 +115,17 @@ class NuisanceFit:
         """Whether there is nothing to fit."""
         return self._count == 0
 
-    def __call__(self, series: Sequence[Sensed], prior_weight: float) -> tuple[list[torch.Tensor], Nuisances]:
-        """Residuals with the best places and delays for the first set of parameters, at which the loss is stationary.
+    def __call__(
+        self, series: Sequence[Sensed], prior_weight: float
+    ) -> tuple[list[torch.Tensor], Nuisances]:
+        """Residuals with the best places and delays for the first set of parameters,
+        at which the loss is stationary.
 
         While the weight of the prior is not known, places and delays are nominal.
 
         Args:
-            series: (E, R, T, M or 4 M, 3) simulated points and (E, R, T, S, 6) readings at the frames, by group.
+            series: (E, R, T, M or 4 M, 3) simulated points and (E, R, T, S, 6) readings at the
+                frames, by group.
             prior_weight: of the squared nuisance parameters in standard deviations.
 
         Returns:
@@ -117,7 +136,9 @@ class NuisanceFit:
             if late is not None:
                 solution[late] = start.delay / self._delay
         if self.is_empty or not prior_weight:
-            return [self._errors(n, sensed, solution) for n, sensed in enumerate(series)], Nuisances()
+            return [
+                self._errors(n, sensed, solution) for n, sensed in enumerate(series)
+            ], Nuisances()
         first = [(points[:1].detach(), loads[:1].detach()) for points, loads in series]
         with torch.no_grad():
             for _ in range(_TURNS if self._accuracy is not None and self._accuracy.turn else 1):
@@ -126,7 +147,10 @@ class NuisanceFit:
                 solution = self._on_grid(first, solution, prior_weight)
                 for _ in range(_STEPS):
                     solution = self._improved(first, solution, prior_weight, self._count)
-            columns = [by.flatten(1, 2).double().cpu().numpy() for _, by in self._linearised(first, solution)]
+            columns = [
+                by.flatten(1, 2).double().cpu().numpy()
+                for _, by in self._linearised(first, solution)
+            ]
         placed = {name: self._placement(name, solution) for name in self._moves}
         sessions = dict.fromkeys(replay.trials.session for replay, _ in self._replays if placed)
         fitted = Nuisances(
@@ -134,7 +158,11 @@ class NuisanceFit:
             rows=math.sqrt(prior_weight) * solution.double().cpu().numpy(),
             sessions={session: placed[session] for session in sessions},
             common=placed.get(None),
-            moves={name: by.double().cpu().numpy() for name, by in self._moves.items() if name is not None},
+            moves={
+                name: by.double().cpu().numpy()
+                for name, by in self._moves.items()
+                if name is not None
+            },
         )
         return [self._errors(n, sensed, solution) for n, sensed in enumerate(series)], fitted
 
@@ -148,23 +176,33 @@ class NuisanceFit:
         if late is None:
             return series
         times, delay = replay.trials.times, self._delay * solution[late] - start.delay
-        step, at = float(times[0, 1]), (times - delay[:, None]).clamp_min(0.0).repeat(len(series), 1)
+        step = float(times[0, 1])
+        at = (times - delay[:, None]).clamp_min(0.0).repeat(len(series), 1)
         flat, beyond = series.flatten(0, 1), (at - times.max()).clamp_min(0.0)[..., None, None]
         ahead = beyond * (flat[:, -1:] - flat[:, -2:-1]) / step  # straight on after the last frame
         return (sample(flat, at, step) + ahead).unflatten(0, series.shape[:2])
 
     def _errors(self, number: int, sensed: Sensed, solution: torch.Tensor) -> torch.Tensor:
         """(E, R, T, 3 M + 6 S) residuals of a group [m]."""
-        replay, (points, loads) = self._replays[number][0], (self._later(number, x, solution) for x in sensed)
+        replay, (points, loads) = (
+            self._replays[number][0],
+            (self._later(number, x, solution) for x in sensed),
+        )
         if self._accuracy is not None:
             points = self._placement(replay.trials.session, solution).places(points)[0]
-        return torch.cat([replay.errors(points).flatten(3), replay.trials.load_errors(loads).flatten(3)], 3)
+        return torch.cat(
+            [replay.errors(points).flatten(3), replay.trials.load_errors(loads).flatten(3)], 3
+        )
 
-    def _linearised(self, first: Sequence[Sensed], solution: torch.Tensor) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    def _linearised(
+        self, first: Sequence[Sensed], solution: torch.Tensor
+    ) -> list[tuple[torch.Tensor, torch.Tensor]]:
         """Weighted residuals (R, T, C) of each group and their derivatives (R, T, C, K)."""
         result = []
         for number, (sensed, weight) in enumerate(zip(first, self._weights, strict=True)):
-            replay, late, root = self._replays[number][0], self._late[number], weight.sqrt()[:, None, None]
+            replay = self._replays[number][0]
+            late = self._late[number]
+            root = weight.sqrt()[:, None, None]
             errors = self._errors(number, sensed, solution)[0]
             columns = errors.new_zeros(*errors.shape, self._count)
             if self._accuracy is not None:
@@ -174,13 +212,16 @@ class NuisanceFit:
                 moved = (slopes @ self._moves[replay.trials.session]).flatten(2, 3)
                 columns[:, :, : moved.shape[2], : self._places] = moved
             if late is not None:
-                step, rows = _DIFFERENCE * float(replay.trials.times[0, 1]), torch.arange(len(errors))
+                step = _DIFFERENCE * float(replay.trials.times[0, 1])
+                rows = torch.arange(len(errors))
                 ends = []
                 for by in (step, -step):
                     moved = solution.clone()
                     moved[late] += by / self._delay
                     ends.append(self._errors(number, sensed, moved)[0])
-                columns[rows, ..., late.start + rows] = (ends[0] - ends[1]) * self._delay / (2.0 * step)
+                columns[rows, ..., late.start + rows] = (
+                    (ends[0] - ends[1]) * self._delay / (2.0 * step)
+                )
             result.append((errors * root, columns * root[..., None]))
         return result
 
@@ -188,7 +229,8 @@ class NuisanceFit:
         self, first: Sequence[Sensed], solution: torch.Tensor, prior_weight: float, count: int
     ) -> torch.Tensor:
         """The solution after a step of the first unknowns of a number."""
-        normal, right = prior_weight * torch.eye(count).to(solution), torch.zeros_like(solution[:count])
+        normal = prior_weight * torch.eye(count).to(solution)
+        right = torch.zeros_like(solution[:count])
         for residual, columns in self._linearised(first, solution) if count else ():
             jacobian = columns[..., :count].flatten(0, 2)
             normal = normal + jacobian.T @ jacobian
@@ -197,7 +239,9 @@ class NuisanceFit:
         change[self._places :].clamp_(-_LONGEST, _LONGEST)
         return torch.cat([solution[:count] + change, solution[count:]])
 
-    def _on_grid(self, first: Sequence[Sensed], solution: torch.Tensor, prior_weight: float) -> torch.Tensor:
+    def _on_grid(
+        self, first: Sequence[Sensed], solution: torch.Tensor, prior_weight: float
+    ) -> torch.Tensor:
         """The solution with the best delays of a grid for each trial."""
         grid, best = torch.linspace(-_FURTHEST, _FURTHEST, _TRIED).to(solution), solution.clone()
         for number, (sensed, late) in enumerate(zip(first, self._late, strict=True)):

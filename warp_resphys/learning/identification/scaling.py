@@ -1,7 +1,8 @@
 """A known law, scaled by one factor to tests of another batch.
 
-Batches of one silicone differ in stiffness by mixing, cure and age, much more than in the shape of their curves. The
-factor minimises the relative errors of the tests, by Gauss-Newton in its logarithm.
+Batches of one silicone differ in stiffness by mixing, cure and age, much more than in the shape of
+their curves. The factor minimises the relative errors of the tests, by Gauss-Newton in its
+logarithm.
 """
 
 import math
@@ -17,16 +18,23 @@ from ...io.errors import ConvergenceError, InputError
 from .material_tests import NOISE, SAMPLES, MeasuredLaw
 from .specimens import MaterialTest
 
-_STIFF: Final = 3.0  # factor to start from: a stiff membrane has an equilibrium, a soft one may burst
+_STIFF: Final = (
+    3.0  # factor to start from: a stiff membrane has an equilibrium, a soft one may burst
+)
 _HALVINGS: Final = 5  # of a step that does not lower the residuals
 _MOST: Final = 0.7  # step of the logarithm
 _TOLERANCE: Final = 1e-3  # its last change
 
-Linear = tuple[FloatArray, FloatArray]  # residuals and derivatives (R,) by the logarithm of the factor
+# Residuals and derivatives (R,) by the logarithm of the factor.
+Linear = tuple[FloatArray, FloatArray]
 
 
 def scale_to_tests(
-    tests: Mapping[str, MaterialTest], known: LawContent, *, density: float, poissons_ratio: float = 0.4995
+    tests: Mapping[str, MaterialTest],
+    known: LawContent,
+    *,
+    density: float,
+    poissons_ratio: float = 0.4995,
 ) -> MeasuredLaw:
     """Returns a known law whose coefficients are all multiplied by the factor that fits tests best.
 
@@ -37,17 +45,26 @@ def scale_to_tests(
         poissons_ratio: of the material at small strains.
 
     Raises:
-        InputError: no test, a test with constants of a machine or with a shear modulus that no elastomer has, or a law
-            with branches or without elastic terms.
+        InputError: no test, a test with constants of a machine or with a shear modulus that no
+            elastomer has, or a law with branches or without elastic terms.
         ConvergenceError: a simulated specimen has no equilibrium.
     """
-    law = {name: value for name, value in known["parameters"].items() if TERMS.fullmatch(name) and value}
+    law = {
+        name: value
+        for name, value in known["parameters"].items()
+        if TERMS.fullmatch(name) and value
+    }
     if not tests:
         raise InputError("tests is empty: a law is scaled to one test or more.")
     if not law or any(name.startswith(("prony", "shear_visc")) for name in known["parameters"]):
-        raise InputError("a law to be scaled has elastic terms alone, such as c10: take one without branches.")
+        raise InputError(
+            "a law to be scaled has elastic terms alone, such as c10: take one without branches."
+        )
     if machines := [name for name, test in tests.items() if test.deviations]:
-        raise InputError(f"{machines[0]} has an unknown machine: set its zero, toe and compliance to 0 to scale a law.")
+        raise InputError(
+            f"{machines[0]} has an unknown machine: set its zero, "
+            "toe and compliance to 0 to scale a law."
+        )
     for name, test in tests.items():
         test.check(name)
 
@@ -59,9 +76,12 @@ def scale_to_tests(
         residuals, slopes, found = list[FloatArray](), list[FloatArray](), columns(x)
         for test in tests.values():
             value, by_law, _ = test.response(test.strain, found)
-            weights = (test.weights * math.sqrt(min(SAMPLES / test.used.sum(), 1.0)) / NOISE)[test.used]
+            weights = test.weights * math.sqrt(min(SAMPLES / test.used.sum(), 1.0)) / NOISE
+            weights = weights[test.used]
             residuals.append((value - test.stress)[test.used] * weights)
-            slopes.append(np.sum([found[name] * by_law[name] for name in law], axis=0)[test.used] * weights)
+            slopes.append(
+                np.sum([found[name] * by_law[name] for name in law], axis=0)[test.used] * weights
+            )
         return np.concatenate(residuals), np.concatenate(slopes)
 
     x, step = math.log(_STIFF), math.inf
@@ -74,7 +94,9 @@ def scale_to_tests(
                 new = linear(x + step)
             except ConvergenceError:  # The specimen is too soft.
                 new = None
-            if new is not None and float(new[0] @ new[0]) <= float(residual @ residual) * (1.0 + 1e-9):
+            if new is not None and float(new[0] @ new[0]) <= float(residual @ residual) * (
+                1.0 + 1e-9
+            ):
                 x, now = x + step, new
                 break
             step *= 0.5
@@ -96,7 +118,9 @@ def _scaled(
     samples = sum(min(SAMPLES, int(test.used.sum())) for test in tests.values())
     relative = max(float(residual @ residual) / samples, 1.0) / float(slope @ slope)
     values = np.array([columns[name] for name in law])
-    errors = {n: math.sqrt(float(np.square(t.away(columns, {})[t.used]).mean())) for n, t in tests.items()}
+    errors = {
+        n: math.sqrt(float(np.square(t.away(columns, {})[t.used]).mean())) for n, t in tests.items()
+    }
     parameters = {"density": density, **{name: columns[name] for name in (*law, "bulk_1")}}
     groups = [name for name in law if name != "c10"]
     low, high = known.get("stretches", (1.0, 1.0))

@@ -1,11 +1,11 @@
 """Search for the parameters with the smallest misfit, from the best of a coarse set of starts.
 
 The misfit (`misfit.BoundedMisfit`) is a sum of squares, which is minimised within bounds by
-`linalg.least_squares.UnitBox` with derivatives along the motions (`Replay.varied`). Its parameters are fractions of
-their ranges, "units" from 0 to 1.
+`linalg.least_squares.UnitBox` with derivatives along the motions (`Replay.varied`). Its parameters
+are fractions of their ranges, "units" from 0 to 1.
 
-After a release, the start of a motion depends on the parameters: it is estimated again with the result, from which the
-search continues, until the loss changes by less than 2 %.
+After a release, the start of a motion depends on the parameters: it is estimated again with the
+result, from which the search continues, until the loss changes by less than 2 %.
 """
 
 import math
@@ -32,8 +32,10 @@ from .uncertainty import Uncertainty
 Report = Callable[[int, float, Mapping[str, float]], None]
 IsLast = Callable[[float], bool]
 
-_SIMILAR = 0.7  # ratio of old and new weights of the priors above which a second descent is not worth its time
-_MOST_AGAIN, _UNCHANGED = 3, 0.98  # estimations of a release after the first; ratio of losses at which they end
+# Ratio of old and new weights of the priors above which a second descent is not worth its time.
+_SIMILAR = 0.7
+# Estimations of a release after the first; ratio of losses at which they end.
+_MOST_AGAIN, _UNCHANGED = 3, 0.98
 _AT_A_BOUND = 1e-4  # of the range
 
 
@@ -44,8 +46,8 @@ class Identification(Identified):
     Attributes:
         parameters, of_trials, placement, first_frames: see `Identified`.
         loss: smallest loss, relative to the motions' amplitudes.
-        history: records of every start, one a step that did not fail: ``loss`` and the parameters. The loss of the last
-            step may be that of the linearisation.
+        history: records of every start, one a step that did not fail: ``loss`` and the parameters.
+            The loss of the last step may be that of the linearisation.
         at_bounds: parameters that ended on a bound.
         uncertainty: of the shared parameters; None if the simulation fails beside the minimum.
         of_trials_deviation: standard deviations of the values of single trials and sessions.
@@ -67,10 +69,14 @@ class Identification(Identified):
         return {} if self.uncertainty is None else self.uncertainty.deviation
 
     def plain(self) -> dict[str, Any]:
-        """Returns the identification as JSON data, without an actuator, which is a file of its own."""
+        """Returns the identification as JSON data, without an actuator,
+        which is a file of its own.
+        """
         where_given = ("of_trials", "of_trials_deviation", "first_frames", "actuator", "test")
         without = replace(self, actuator={}, test=None)
-        return {key: value for key, value in asdict(without).items() if value or key not in where_given}
+        return {
+            key: value for key, value in asdict(without).items() if value or key not in where_given
+        }
 
     @staticmethod
     def from_plain(plain: Any) -> "Identification":
@@ -83,12 +89,18 @@ class Identification(Identified):
             return _PLAIN.validate_python(plain)
         except ValidationError as error:
             key = ".".join(map(str, error.errors()[0]["loc"]))
-            raise DataFileError(f"{key} is not of an identification of this version: identify again.") from error
+            raise DataFileError(
+                f"{key} is not of an identification of this version: identify again."
+            ) from error
 
     @classmethod
     def read(cls, path: Path) -> "dict[str, Identification]":
         """Returns the identifications in identification.json by model; empty without a file."""
-        return {name: cls.from_plain(plain) for name, plain in read_json(path).items()} if path.is_file() else {}
+        return (
+            {name: cls.from_plain(plain) for name, plain in read_json(path).items()}
+            if path.is_file()
+            else {}
+        )
 
 
 _PLAIN = TypeAdapter(Identification)
@@ -105,7 +117,8 @@ def refined_searches(
     labels: Sequence[str] = (),
     released: bool = False,
 ) -> list[Identification]:
-    """Returns the results of a search, and of those with releases that are estimated again with the last result.
+    """Returns the results of a search, and of those with releases
+    that are estimated again with the last result.
 
     They end when the loss changes by less than 2 %.
 
@@ -121,9 +134,15 @@ def refined_searches(
         released: whether the trials begin by a release.
     """
     results, again = list[Identification](), _MOST_AGAIN if released else 0
-    before = [kept.parts[name]["history"] for number in range(1 + again) if (name := f"{key} {number}") in kept.parts]
+    before = [
+        kept.parts[name]["history"]
+        for number in range(1 + again)
+        if (name := f"{key} {number}") in kept.parts
+    ]
     done = sum(len(records) for history in before for records in history)
-    with Progress(title, (starts + again) * max_evaluations, "evaluations at most", done) as progress:
+    with Progress(
+        title, (starts + again) * max_evaluations, "evaluations at most", done
+    ) as progress:
 
         def report(start: int, loss: float, values: Mapping[str, float]) -> None:
             name, value = next(iter(values.items()))
@@ -145,11 +164,17 @@ def refined_searches(
 
 def _ends(last: bool, before: float | None, after: float) -> bool:
     """Whether a search is the last, by its loss and that of the search before."""
-    return last or (before is not None and _UNCHANGED < after / max(before, 1e-300) < 1.0 / _UNCHANGED)
+    return last or (
+        before is not None and _UNCHANGED < after / max(before, 1e-300) < 1.0 / _UNCHANGED
+    )
 
 
 def first_points(
-    misfit: BoundedMisfit, first: Mapping[str, float], count: int = 1, candidates: int = 0, seed: int = 0
+    misfit: BoundedMisfit,
+    first: Mapping[str, float],
+    count: int = 1,
+    candidates: int = 0,
+    seed: int = 0,
 ) -> list[dict[str, float]]:
     """The first guess, and the best of random candidates in the ranges.
 
@@ -186,28 +211,36 @@ def search_parameters(
         misfit: of the parameters.
         starts: a value of each parameter, for each start.
         max_evaluations: of the loss and its gradient, for each start.
-        tolerance: relative decrease of the loss below which the search ends; a step from which the linearisation
-            expects less is not evaluated.
-        report: called after every evaluation with the start's number, the loss (infinite where the simulation failed)
-            and the parameters.
-        is_last: whether no other search follows one with a loss; if not, placement and uncertainty are left out.
+        tolerance: relative decrease of the loss below which the search ends; a step from which the
+            linearisation expects less is not evaluated.
+        report: called after every evaluation with the start's number, the loss (infinite where the
+            simulation failed) and the parameters.
+        is_last: whether no other search follows one with a loss; if not, placement and uncertainty
+            are left out.
         labels: names of the markers, if their places are uncertain.
 
     Raises:
         ConvergenceError: the simulation fails at every start.
     """
-    attempts = [_descend(misfit, k, start, max_evaluations, tolerance, report) for k, start in enumerate(starts)]
+    attempts = [
+        _descend(misfit, k, start, max_evaluations, tolerance, report)
+        for k, start in enumerate(starts)
+    ]
     good = [attempt for attempt in attempts if attempt.loss < math.inf]
     if not good:
         reason = misfit.failure or "motions that are not finite"
-        raise ConvergenceError(f"the simulation failed at every start of the identification: {reason}", None, None)
+        raise ConvergenceError(
+            f"the simulation failed at every start of the identification: {reason}", None, None
+        )
     best = min(good, key=lambda attempt: attempt.loss)
     unit, misfit.prior_weight, last = best.unit, best.prior_weight, is_last(best.loss)
     identified = Identification(
         parameters=misfit.from_unit(unit),
         loss=best.loss,
         history=[attempt.history for attempt in attempts],
-        at_bounds=tuple(n for n, u in zip(misfit.bounds, unit, strict=True) if min(u, 1.0 - u) < _AT_A_BOUND),
+        at_bounds=tuple(
+            n for n, u in zip(misfit.bounds, unit, strict=True) if min(u, 1.0 - u) < _AT_A_BOUND
+        ),
         placement=misfit.nuisances(unit).plain(labels) if last else None,
         uncertainty=misfit.uncertainty(unit) if last else None,
     )
@@ -248,7 +281,11 @@ def _descend(
         if not math.isfinite(float(begin.value)):
             return begin
         end = minimise(problem, begin, tolerance, most - 1).point
-        return replace(end, value=torch.full_like(end.value, torch.inf)) if problem.differentiates is False else end
+        return (
+            replace(end, value=torch.full_like(end.value, torch.inf))
+            if problem.differentiates is False
+            else end
+        )
 
     misfit.prior_weight = 0.0
     misfit.forget()

@@ -1,10 +1,11 @@
 """Derivatives of predicted markers by the identified parameters, and what follows from them.
 
-That is how uncertain predictions are because the parameters are, predictions without a trial that was identified from,
-and what could explain the errors that remain: gain and zero of the inputs, or marker places. Every such quantity is
-fitted to the trial itself, so that the fits tell where an error comes from and are no predictions: where a scale of the
-inputs takes most of an error away, the simulator lacks physics of the actuator, or the recording does not contain what
-the actuator did.
+That is how uncertain predictions are because the parameters are, predictions without a trial that
+was identified from, and what could explain the errors that remain: gain and zero of the inputs, or
+marker places. Every such quantity is fitted to the trial itself, so that the fits tell where an
+error comes from and are no predictions: where a scale of the inputs takes most of an error away,
+the simulator lacks physics of the actuator, or the recording does not contain what the actuator
+did.
 """
 
 import logging
@@ -27,13 +28,21 @@ from ...io.progress import Progress
 from ...linalg.threads import in_threads, thread_count
 from ..metrics import mean_distance
 from ..observed_motions import ObservedMotions
-from ..parameters import HUNG, configured_parameters, exact, parameters_of_parts, split_name, value_name
+from ..parameters import (
+    HUNG,
+    configured_parameters,
+    exact,
+    parameters_of_parts,
+    split_name,
+    value_name,
+)
 from ..placement import DisplacedMarkers, Placement, by_placement, placement_of
 from .search import Identification
 
 log = logging.getLogger(__name__)
 
-_DIFFERENCE = 1e-3  # of a parameter, over its standard deviation, or over the typical size of an input's response
+# Of a parameter, over its standard deviation, or over the typical size of an input's response.
+_DIFFERENCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -42,9 +51,10 @@ class Sensitivity:
 
     Attributes:
         points: (T, M, 3) [m].
-        by_parameter: (T, M, 3) by parameter; a value of the trial's own moves in place of the common one.
-        by_placement: (T, M, 3, 3 M + 6) by the offsets of the markers on the body, and the shift and the rotation
-            vector of the recording's frame; None where markers are seen in part.
+        by_parameter: (T, M, 3) by parameter; a value of the trial's own moves in place of the
+            common one.
+        by_placement: (T, M, 3, 3 M + 6) by the offsets of the markers on the body, and the shift
+            and the rotation vector of the recording's frame; None where markers are seen in part.
     """
 
     points: FloatArray
@@ -53,7 +63,7 @@ class Sensitivity:
 
 
 def _responses(trials: Trials) -> dict[str, str]:
-    """Parameters for a scale and a zero of the inputs that drive trials, by name, with their word."""
+    """Parameters for a scale and a zero of inputs that drive trials, by name, with their word."""
     driven = [name for name, values in trials.inputs.items() if name not in HUNG and values.any()]
     return {f"{name}_{word}": word for name in driven for word in ("factor", "zero")}
 
@@ -65,12 +75,13 @@ def sensitivities(
     identified: Identification,
     batch: int | None = None,
 ) -> dict[str, Sensitivity]:
-    """Returns the derivatives of trials by the parameters of a simulator and the gains and zeros of its inputs.
+    """Returns derivatives of trials by parameters of a simulator and gains and zeros of its inputs.
 
     Args:
         simulator: of which the parameters were identified.
         motions: trials with markers.
-        names: names of the trials; those that cannot be simulated are left out, which a warning says.
+        names: names of the trials; those that cannot be simulated are left out, which a warning
+            says.
         identified: parameters and their uncertainty.
         batch: largest number of trials that are simulated together; None for all.
     """
@@ -85,13 +96,24 @@ def sensitivities(
         try:
             return _of_batch(simulator, motions, some, identified, moved)
         except ConvergenceError as error:
-            log.warning("evaluate: the posterior does not widen the intervals of %s: %s", listed(some), error)
+            log.warning(
+                "evaluate: the posterior does not widen the intervals of %s: %s",
+                listed(some),
+                error,
+            )
             return {}
 
     threads = thread_count() if simulator.rest_positions.device.type == "cpu" else 1
-    with Progress("Differentiating the test trials", len(names), "trials") as progress, torch.no_grad():
-        for _, some in (part for whole in motions.trials.batches(names) for part in cut(whole, batch)):
-            for shared in in_threads(differentiated, [part for k in range(threads) if (part := some[k::threads])]):
+    with (
+        Progress("Differentiating the test trials", len(names), "trials") as progress,
+        torch.no_grad(),
+    ):
+        for _, some in (
+            part for whole in motions.trials.batches(names) for part in cut(whole, batch)
+        ):
+            for shared in in_threads(
+                differentiated, [part for k in range(threads) if (part := some[k::threads])]
+            ):
                 found |= shared
             progress.advance(len(some))
     return found
@@ -110,21 +132,33 @@ def _of_batch(
     start = motions.start(replay, identified)
     if isinstance(observe, Markers) and not isinstance(observe, ViewedMarkers):
         assert trials.bound is not None
-        placement = Placement.none(len(trials.labels), simulator.tensor(np.mean(trials.bound, axis=0)))
+        placement = Placement.none(
+            len(trials.labels), simulator.tensor(np.mean(trials.bound, axis=0))
+        )
         if identified.placement is not None:
             placement = placement_of(identified.placement, trials.labels, trials.session(names[0]))
             placement = placement.to(simulator.rest_positions)
         unplaced = motions.replay(simulator, names, replace(identified, placement=None))
         replay, start = DisplacedMarkers.replay(unplaced, start)
-    configured = {name: simulator.tensor([x]) for name, x in configured_parameters(simulator, moved).items()}
-    sets = {name: x.repeat(1 + len(moved)) for name, x in {**configured, **identified.values(simulator)}.items()}
-    rows, of_parts = {parameter: row for row, parameter in enumerate(moved, 1)}, parameters_of_parts(simulator)
+    configured = {
+        name: simulator.tensor([x]) for name, x in configured_parameters(simulator, moved).items()
+    }
+    sets = {
+        name: x.repeat(1 + len(moved))
+        for name, x in {**configured, **identified.values(simulator)}.items()
+    }
+    rows = {parameter: row for row, parameter in enumerate(moved, 1)}
+    of_parts = parameters_of_parts(simulator)
     for name in sets:
         if (parameter := split_name(name)[0]) in moved:
             sets[name][rows[parameter]] += moved[parameter]
-        if (whole := of_parts.get(parameter, ("", 0))[0]) in moved and whole not in identified.parameters:
+        if (
+            whole := of_parts.get(parameter, ("", 0))[0]
+        ) in moved and whole not in identified.parameters:
             # What moves all parts moves each: factors relatively.
-            sets[name][rows[whole]] += moved[whole] * (sets[name][0] if whole.endswith("_factor") else 1.0)
+            sets[name][rows[whole]] += moved[whole] * (
+                sets[name][0] if whole.endswith("_factor") else 1.0
+            )
     points, _ = (replay.varied if moved and not replay.is_static else replay.sensed)(start, sets)
     slopes: Any = [None] * len(names)
     if placement is not None:
@@ -134,7 +168,9 @@ def _of_batch(
     return {
         name: Sensitivity(
             points=shown[0, trial],
-            by_parameter={p: (shown[row, trial] - shown[0, trial]) / moved[p] for p, row in rows.items()},
+            by_parameter={
+                p: (shown[row, trial] - shown[0, trial]) / moved[p] for p, row in rows.items()
+            },
             by_placement=slopes[trial],
         )
         for trial, name in enumerate(names)
@@ -150,9 +186,10 @@ def parameter_spread(
 ) -> FloatArray | None:
     """Returns the variance of predicted markers under the posterior of identified parameters.
 
-    The variance is to first order, J S J^T with the derivatives J of the markers by the parameters and the covariance S
-    of these, so that it grows with the distance from the trials that determine them. In a session without identified
-    trials, the prior of its placement adds its variance. The ranges of the parameters limit their covariance.
+    The variance is to first order, J S J^T with the derivatives J of the markers by the parameters
+    and the covariance S of these, so that it grows with the distance from the trials that determine
+    them. In a session without identified trials, the prior of its placement adds its variance. The
+    ranges of the parameters limit their covariance.
 
     Args:
         trials: of the motions.
@@ -162,8 +199,8 @@ def parameter_spread(
         left_out: whether the posterior of a trial that was identified from is that without it.
 
     Returns:
-        Means (R, T, M) over the coordinates, of markers and of the positions of rigid bodies [m^2]; None if the
-        uncertainty of the parameters is not known.
+        Means (R, T, M) over the coordinates, of markers and of the positions of rigid bodies [m^2];
+        None if the uncertainty of the parameters is not known.
     """
     uncertainty, placement = identified.uncertainty, identified.placement
     if uncertainty is None:
@@ -172,15 +209,23 @@ def parameter_spread(
     spread = np.zeros((len(names), trials.observed.shape[1], len(owners(trials.labels))))
     for row, name in ((row, name) for row, name in enumerate(names) if name in linear):
         posterior = uncertainty.left_out.get(name, uncertainty) if left_out else uncertainty
-        deviation, correlation = np.array([*posterior.deviation.values()]), np.array(posterior.correlation)
+        deviation = np.array([*posterior.deviation.values()])
+        correlation = np.array(posterior.correlation)
         session = trials.session(name)
         for at, parameter in enumerate(posterior.deviation):
-            of_trial = (identified.of_trials_deviation.get(value_name(parameter, owner)) for owner in (name, session))
-            if (known := next((value for value in of_trial if value is not None), None)) is not None:
+            of_trial = (
+                identified.of_trials_deviation.get(value_name(parameter, owner))
+                for owner in (name, session)
+            )
+            if (
+                known := next((value for value in of_trial if value is not None), None)
+            ) is not None:
                 deviation[at], correlation[at], correlation[:, at] = known, 0.0, 0.0
                 correlation[at, at] = 1.0
         root = deviation[:, None] * _root(correlation, deviation / ranges)
-        slopes = np.stack([linear[name].by_parameter[parameter] for parameter in posterior.deviation])
+        slopes = np.stack(
+            [linear[name].by_parameter[parameter] for parameter in posterior.deviation]
+        )
         moved = as_markers(np.einsum("eTmc,ei->iTmc", slopes, root), trials.labels)
         spread[row, : moved.shape[1]] = np.nan_to_num(np.square(moved).sum(0).mean(-1))
         places = linear[name].by_placement
@@ -193,10 +238,11 @@ def parameter_spread(
 
 
 def _root(correlation: FloatArray, shares: FloatArray) -> FloatArray:
-    """R with R R^T the covariance of parameters over their standard deviations, which their ranges limit.
+    """R with R R^T the covariance of parameters over their standard deviations,
+    which their ranges limit.
 
-    A range counts as a normal distribution of the variance of a uniform one: where the data leave a parameter open, the
-    linearised posterior would reach far beyond it.
+    A range counts as a normal distribution of the variance of a uniform one: where the data leave a
+    parameter open, the linearised posterior would reach far beyond it.
 
     Args:
         correlation: (P, P) of the posterior.
@@ -208,9 +254,13 @@ def _root(correlation: FloatArray, shares: FloatArray) -> FloatArray:
 
 
 def left_out_changes(
-    trials: Trials, names: Sequence[str], identified: Identification, linear: Mapping[str, Sensitivity]
+    trials: Trials,
+    names: Sequence[str],
+    identified: Identification,
+    linear: Mapping[str, Sensitivity],
 ) -> FloatArray | None:
-    """Returns by what predictions of trials change if parameters are identified without them, to first order.
+    """Returns by what predictions of trials change if parameters are identified
+    without them, to first order.
 
     Returns:
         (R, T, M, 3) [m]; None if no trial changes, as those from which nothing was identified.
@@ -228,7 +278,9 @@ def left_out_changes(
 
 
 class FreeFit(TypedDict):
-    """Mean error of a trial [mm], and what would remain of it if something were free, see `free_fits`."""
+    """Mean error of a trial [mm], and what would remain of it
+    if something were free, see `free_fits`.
+    """
 
     name: str
     as_is_mm: float
@@ -244,9 +296,10 @@ def free_fits(
 ) -> list[FreeFit]:
     """Returns what would remain of the errors of trials if something were free, by trial.
 
-    The keys of ``left_mm`` and ``values`` are: ``scale`` of the inputs (its change) and their ``zero`` (in their unit),
-    common to all of a trial's inputs; and the ``places`` of the markers and the frame of the recordings, which all
-    tested trials of a session share. What the trials do not determine is left out.
+    The keys of ``left_mm`` and ``values`` are: ``scale`` of the inputs (its change) and their
+    ``zero`` (in their unit), common to all of a trial's inputs; and the ``places`` of the markers
+    and the frame of the recordings, which all tested trials of a session share. What the trials do
+    not determine is left out.
 
     Args:
         trials: of the motions.
@@ -254,7 +307,8 @@ def free_fits(
         simulated: (T, M, 3) predicted markers by trial [m].
         linear: derivatives by trial; those without are left out.
     """
-    counts = {name: len(of_trial.points) for name, of_trial in linear.items()}  # one frame of a pose
+    # One frame of a pose.
+    counts = {name: len(of_trial.points) for name, of_trial in linear.items()}
     errors = {n: (simulated[n] - seen)[: counts[n]] for n, seen in observed.items() if n in linear}
     errors = {name: error for name, error in errors.items() if np.isfinite(error).any()}
 
@@ -278,19 +332,30 @@ def free_fits(
         places = [slopes for name in members if (slopes := linear[name].by_placement) is not None]
         if len(places) < len(members):
             continue
-        sizes = [float(np.sqrt(np.nanmean(np.square(errors[name])))) or 1.0 for name in members]  # Trials count alike.
+        # Trials count alike.
+        sizes = [float(np.sqrt(np.nanmean(np.square(errors[name])))) or 1.0 for name in members]
         scaled = (
-            [x / size for x, size in zip(of, sizes, strict=True)] for of in ([errors[n] for n in members], places)
+            [x / size for x, size in zip(of, sizes, strict=True)]
+            for of in ([errors[n] for n in members], places)
         )
         if (best := _least(*scaled)) is not None:
             for name, slopes in zip(members, places, strict=True):
                 left[name]["places"] = mean(errors[name] + slopes @ best)
-    return [{"name": n, "as_is_mm": mean(e), "left_mm": left[n], "values": values[n]} for n, e in errors.items()]
+    return [
+        {"name": n, "as_is_mm": mean(e), "left_mm": left[n], "values": values[n]}
+        for n, e in errors.items()
+    ]
 
 
 def _least(errors: Sequence[FloatArray], columns: Sequence[FloatArray]) -> FloatArray | None:
-    """(K,) values with the least squares of errors (T, M, 3) + columns (T, M, 3, K) values; None if not determined."""
-    seen = [np.isfinite(error) & np.isfinite(slopes).all(-1) for error, slopes in zip(errors, columns, strict=True)]
+    """(K,) values with the least squares of errors (T, M, 3) + columns (T, M, 3, K) values.
+
+    None if not determined.
+    """
+    seen = [
+        np.isfinite(error) & np.isfinite(slopes).all(-1)
+        for error, slopes in zip(errors, columns, strict=True)
+    ]
     right = np.concatenate([error[where] for error, where in zip(errors, seen, strict=True)])
     matrix = np.concatenate([slopes[where] for slopes, where in zip(columns, seen, strict=True)])
     if len(right) <= 2 * matrix.shape[1] or not matrix.any():

@@ -1,16 +1,19 @@
-"""Samples of a test that cannot be of its specimen: after it broke, and readings of a load cell that drop out.
+"""Samples of a test that cannot be of its specimen: after it broke,
+and readings of a load cell that drop out.
 
 Both are found on the curve itself, in the order of its samples, before any law is fitted.
 
-A break: the stress falls to 0.15 of what it was, or less, within four samples in which the strain does not fall, and
-stays there to the end; or the strain falls, as the machine returns, to one at which half of that stress was reached
-before, where that was half of the largest or more. The samples from the fall on are strays. Elastomers relax by less,
-and have more stress where they are unloaded.
+A break: the stress falls to 0.15 of what it was, or less, within four samples in which the strain
+does not fall, and stays there to the end; or the strain falls, as the machine returns, to one at
+which half of that stress was reached before, where that was half of the largest or more. The
+samples from the fall on are strays. Elastomers relax by less, and have more stress where they are
+unloaded.
 
-A dropout: a run of up to ten samples whose strains lie between those of the samples before and after it, while their
-stresses lie below half of the least of those, if they are positive, or above twice the largest; by more than 2 % of the
-largest stress of the test, 5 % above, and twelve times the usual roughness of the curve there. At a turn of the strain,
-as in cycles, the strain lies outside, too; after a step of the strain, stresses may pass at once, and are no strays.
+A dropout: a run of up to ten samples whose strains lie between those of the samples before and
+after it, while their stresses lie below half of the least of those, if they are positive, or above
+twice the largest; by more than 2 % of the largest stress of the test, 5 % above, and twelve times
+the usual roughness of the curve there. At a turn of the strain, as in cycles, the strain lies
+outside, too; after a step of the strain, stresses may pass at once, and are no strays.
 """
 
 from typing import Final
@@ -21,9 +24,12 @@ from ...io.arrays import BoolArray, FloatArray
 
 _BROKEN: Final = 0.15  # of the stress before, at most, that is left after a break
 _LOADED: Final = 0.2  # of the largest stress, at least, before a break
-_RETURNS: Final = 0.5  # of the stress before a break, that is at a strain to which the machine returns at once
+_RETURNS: Final = (
+    0.5  # of the stress before a break, that is at a strain to which the machine returns at once
+)
 _FALL: Final = 4  # samples in which a specimen tears
-_STILL: Final = 0.05  # of the range of strains, by which a strain falls that counts as constant; of a dropout a fifth
+# Of the range of strains, by which a strain falls that counts as constant; of a dropout a fifth.
+_STILL: Final = 0.05
 _LONGEST: Final = 10  # samples of a dropout
 _BESIDE: Final = 2  # samples before and after it that it is compared with
 _NEAR: Final = 10  # samples on each side that show how rough the curve is
@@ -35,7 +41,8 @@ _ROUGH: Final = 12.0  # ratio to the roughness; 5 standard deviations or more of
 
 
 def strays(strain: FloatArray, stress: FloatArray) -> dict[str, BoolArray]:
-    """Returns samples (N,) in dropouts and after a break, by a few words on them, of those that there are.
+    """Returns samples (N,) in dropouts and after a break,
+    by a few words on them, of those that there are.
 
     Args:
         strain: (N,) in the order of the test.
@@ -65,7 +72,8 @@ def _end(strain: FloatArray, stress: FloatArray) -> int:
         if before <= least or highest_after[first] > _BROKEN * before:
             continue
         reached = np.maximum.accumulate(strain[: last + 1])
-        loaded = float(np.interp(strain[first], reached, stress[: last + 1]))  # at the same strain before
+        # At the same strain before.
+        loaded = float(np.interp(strain[first], reached, stress[: last + 1]))
         returns = loaded >= _RETURNS * before >= _RETURNS**2 * highest_after[0]
         if strain[last : first + 1].min() >= strain[last] - still or returns:
             return last + 1
@@ -73,20 +81,27 @@ def _end(strain: FloatArray, stress: FloatArray) -> int:
 
 
 def _quantum(stress: FloatArray) -> float:
-    """Returns the least difference of successive stresses that differ, the resolution of a coarse load cell."""
+    """Returns the least difference of successive stresses that differ,
+    the resolution of a coarse load cell.
+    """
     steps = np.abs(np.diff(stress))
     return float(steps[steps > 0.0].min(initial=np.inf)) if steps.any() else 0.0
 
 
 def _dropout(strain: FloatArray, stress: FloatArray) -> slice | None:
     """Returns the shortest run of samples that is a dropout, None without one."""
-    strain, stress = (np.pad(values, 1, "edge") if len(values) else values for values in (strain, stress))
-    count, size, slack = len(strain), float(np.abs(stress).max(initial=0.0)), 0.2 * _STILL * float(np.ptp(strain))
+    strain, stress = (
+        np.pad(values, 1, "edge") if len(values) else values for values in (strain, stress)
+    )
+    count = len(strain)
+    size = float(np.abs(stress).max(initial=0.0))
+    slack = 0.2 * _STILL * float(np.ptp(strain))
     rough = np.abs(stress[1:-1] - 0.5 * (stress[:-2] + stress[2:]))
     usual = float(np.median(rough)) if len(rough) else 0.0
     for length in range(1, min(_LONGEST, count - 2 * _BESIDE) + 1):
         windows = [
-            np.lib.stride_tricks.sliding_window_view(values, length + 2 * _BESIDE) for values in (strain, stress)
+            np.lib.stride_tricks.sliding_window_view(values, length + 2 * _BESIDE)
+            for values in (strain, stress)
         ]
         run = slice(_BESIDE, _BESIDE + length)
         strains, stresses = (np.delete(window, np.r_[run], axis=1) for window in windows)
@@ -105,7 +120,8 @@ def _dropout(strain: FloatArray, stress: FloatArray) -> slice | None:
         even = steps.max(1) <= np.maximum(_STEP * np.median(steps, 1), 5.0 * slack)
         for start in np.flatnonzero((drops | spikes) & between.all(1) & even & ~turns):
             first = start + _BESIDE
-            before, after = rough[max(first - 2 - _NEAR, 0) : max(first - 2, 0)], rough[first + length :][:_NEAR]
+            before = rough[max(first - 2 - _NEAR, 0) : max(first - 2, 0)]
+            after = rough[first + length :][:_NEAR]
             near = float(np.median(np.append(before, after))) if len(before) + len(after) else 0.0
             if away[start] > max(_ROUGH * max(near, 0.5 * usual), _QUANTA * _quantum(stress)):
                 return slice(first - 1, first - 1 + length)

@@ -1,17 +1,20 @@
-"""Uncertainty of identified parameters, from the residuals and their derivatives at the minimum (Gauss-Newton).
+"""Uncertainty of identified parameters, from the residuals
+and their derivatives at the minimum (Gauss-Newton).
 
-The covariance is (J^T J)^-1 (sum_r S_r) (J^T J)^-1, with S_r the covariance of a trial's gradient J_r^T e. Its errors e
-are as large as its residuals and as correlated in time, up to the first zero of their autocorrelation (Newey and West
-1987, with one autocorrelation for all coordinates). The priors count as one more trial, with independent errors.
+The covariance is (J^T J)^-1 (sum_r S_r) (J^T J)^-1, with S_r the covariance of a trial's gradient
+J_r^T e. Its errors e are as large as its residuals and as correlated in time, up to the first zero
+of their autocorrelation (Newey and West 1987, with one autocorrelation for all coordinates). The
+priors count as one more trial, with independent errors.
 
-Residuals of trials from which parameters were identified are smaller than errors of predictions. To first order, they
-are identified without one of the trials, too. Without trial r, the parameters minimise
+Residuals of trials from which parameters were identified are smaller than errors of predictions. To
+first order, they are identified without one of the trials, too. Without trial r, the parameters
+minimise
 
     sum_{s != r} |e_s + J_s d + C_s p|^2 + priors
 
-in their change d and that p of places and delays, with the residuals e, J and C their derivatives (Cook and Weisberg,
-Residuals and Influence in Regression, 1982). So a trial that determines a parameter alone has its error with the
-parameter's prior.
+in their change d and that p of places and delays, with the residuals e, J and C their derivatives
+(Cook and Weisberg, Residuals and Influence in Regression, 1982). So a trial that determines a
+parameter alone has its error with the parameter's prior.
 """
 
 import math
@@ -61,7 +64,9 @@ class LinearMisfit:
     @property
     def loss(self) -> float:
         """Sum of the squares."""
-        return float(sum(np.square(trial.rows).sum() for trial in self.trials) + np.square(self.prior).sum())
+        return float(
+            sum(np.square(trial.rows).sum() for trial in self.trials) + np.square(self.prior).sum()
+        )
 
     @property
     def gradient(self) -> FloatArray:
@@ -76,19 +81,24 @@ class LinearMisfit:
         return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior_slopes))
 
     def _follow(self, values: Sequence[FloatArray], prior: FloatArray | float = 0.0) -> FloatArray:
-        """Returns the change (K, ...) of places and delays with the least squares of values, priors included.
+        """Returns the change (K, ...) of places and delays
+        with the least squares of values, priors included.
 
         Args:
             values: (T C, ...) by trial.
             prior: (K, ...) weighted residuals of the priors of places and delays.
         """
         normal = np.sum([trial.columns.T @ trial.columns for trial in self.trials], axis=0)
-        right = np.sum([trial.columns.T @ of for trial, of in zip(self.trials, values, strict=True)], axis=0)
+        right = np.sum(
+            [trial.columns.T @ of for trial, of in zip(self.trials, values, strict=True)], axis=0
+        )
         right = right + math.sqrt(self.prior_weight) * prior
         return np.asarray(-np.linalg.solve(normal + self.prior_weight * np.eye(len(normal)), right))
 
     def eliminated(self) -> "LinearMisfit":
-        """Returns the misfit in which places and delays follow the parameters (Kaufman, BIT 15 (1975) 49)."""
+        """Returns the misfit in which places and delays follow the parameters (Kaufman, BIT 15
+        (1975) 49).
+        """
         follow = self._follow([trial.slopes for trial in self.trials])
         further = math.sqrt(self.prior_weight) * follow
         return LinearMisfit(
@@ -99,10 +109,15 @@ class LinearMisfit:
         )
 
     def places(self, step: FloatArray, session: str) -> list[float] | None:
-        """(3 M + 6,) change of a session's placement with a step (P,) of the parameters; None if places are exact."""
+        """(3 M + 6,) change of a session's placement with a step (P,) of the parameters.
+
+        None if places are exact.
+        """
         if self.nuisances.common is None:
             return None
-        moved = self._follow([trial.rows.ravel() + trial.slopes @ step for trial in self.trials], self.nuisances.rows)
+        moved = self._follow(
+            [trial.rows.ravel() + trial.slopes @ step for trial in self.trials], self.nuisances.rows
+        )
         moves = self.nuisances.moves[session]
         return [float(value) for value in moves @ moved[: moves.shape[1]]]
 
@@ -112,7 +127,7 @@ class LeftOut:
     """Identification without one of its trials, to first order."""
 
     change: dict[str, float]  # of the parameters, in their units
-    placement: list[float] | None  # (3 M + 6,) change of the trial's marker offsets [m], shift [m] and turn [rad]
+    placement: list[float] | None  # (3 M + 6,) of the trial's marker offsets, shift [m], turn [rad]
     deviation: dict[str, float]  # see `Uncertainty`
     correlation: list[list[float]]
 
@@ -126,11 +141,13 @@ class Uncertainty(Brief):
     # the least certain direction: weights of the parameters, in fractions of their ranges
     poorest: dict[str, float]
     poorest_deviation: float  # standard deviation along it, as a fraction of the ranges
-    ranges: dict[str, float]  # derivative of each parameter by its fraction of its range, in its unit
+    ranges: dict[str, float]  # derivative by the fraction of each range, in the value's unit
     left_out: dict[str, LeftOut] = field(default_factory=dict)  # by trial; empty with less than two
 
 
-def uncertainty_of(linear: LinearMisfit, bounds: Mapping[str, Bounds], unit: FloatArray) -> Uncertainty:
+def uncertainty_of(
+    linear: LinearMisfit, bounds: Mapping[str, Bounds], unit: FloatArray
+) -> Uncertainty:
     """Returns the uncertainty of P parameters at the minimum.
 
     Args:
@@ -141,14 +158,21 @@ def uncertainty_of(linear: LinearMisfit, bounds: Mapping[str, Bounds], unit: Flo
     trials, prior = linear.trials, linear.prior_slopes
     free = 1.0 - min(len(unit) / sum(trial.seen for trial in trials), 0.5)
     scatter = [
-        np.square(trial.rows).sum() / (trial.seen * free) * _scatter(trial.rows, trial.slopes) for trial in trials
+        np.square(trial.rows).sum() / (trial.seen * free) * _scatter(trial.rows, trial.slopes)
+        for trial in trials
     ]
     scatter.append(linear.prior_weight * prior.T @ prior)
-    curvature = np.sum([trial.slopes.T @ trial.slopes for trial in trials], axis=0) + prior.T @ prior
+    curvature = (
+        np.sum([trial.slopes.T @ trial.slopes for trial in trials], axis=0) + prior.T @ prior
+    )
     values, vectors = np.linalg.eigh(curvature)
-    known = values > 1e-12 * max(values[-1], 1e-300)  # The data say nothing about the other directions.
+    # The data say nothing about the other directions.
+    known = values > 1e-12 * max(values[-1], 1e-300)
     inverse = vectors[:, known] / values[known] @ vectors[:, known].T
-    covariance = inverse @ np.sum(scatter, axis=0) @ inverse + vectors[:, ~known] / _UNIFORM @ vectors[:, ~known].T
+    covariance = (
+        inverse @ np.sum(scatter, axis=0) @ inverse
+        + vectors[:, ~known] / _UNIFORM @ vectors[:, ~known].T
+    )
     deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     slopes = [range_.slope(u) for range_, u in zip(bounds.values(), unit, strict=True)]
     poorest = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0])
@@ -162,7 +186,8 @@ def uncertainty_of(linear: LinearMisfit, bounds: Mapping[str, Bounds], unit: Flo
 
 
 def _scatter(rows: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """(P, P) covariance of J^T e, for errors e of unit variance that are as correlated in time as the residuals.
+    """(P, P) covariance of J^T e, for errors e of unit variance
+    that are as correlated in time as the residuals.
 
     Args:
         rows: (T, C) the residuals.
@@ -173,14 +198,18 @@ def _scatter(rows: FloatArray, jacobian: FloatArray) -> FloatArray:
     for lag, correlation in enumerate(autocorrelation(rows), 1):
         lagged = correlation * np.einsum("tcp,tcq->pq", slopes[lag:], slopes[:-lag])
         covariance += lagged + lagged.T
-    values, vectors = np.linalg.eigh(covariance)  # A truncated autocorrelation may leave negative eigenvalues.
+    # A truncated autocorrelation may leave negative eigenvalues.
+    values, vectors = np.linalg.eigh(covariance)
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
-def left_out(system: LinearMisfit, bounds: Mapping[str, Bounds], unit: FloatArray) -> dict[str, LeftOut]:
+def left_out(
+    system: LinearMisfit, bounds: Mapping[str, Bounds], unit: FloatArray
+) -> dict[str, LeftOut]:
     """Returns the identification without each of the trials; empty with less than two.
 
-    Ranges count as normal distributions of the same variance, as what no other trial determines could be anything.
+    Ranges count as normal distributions of the same variance, as what no other trial determines
+    could be anything.
 
     Args:
         system: misfit at the minimum, of which places and delays are not eliminated.

@@ -1,1 +1,3 @@
-"""Residual forces: their reconstruction, the networks that predict them, and simulators corrected by them."""
+"""Residual forces: their reconstruction, the networks that predict them,
+and simulators corrected by them.
+"""

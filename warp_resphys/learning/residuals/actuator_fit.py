@@ -1,19 +1,21 @@
 """Learns what the actuators of a robot do beyond their identified response.
 
-Forces in the modes of a body are more than a few markers can tell. What a driven robot has and its model lacks lies
-mostly in its few inputs: chambers made by hand differ, creep, and act on each other. So the effective inputs are the
-identified response x to the commands and a network f of x and its exponential means (`InputNetwork`).
+Forces in the modes of a body are more than a few markers can tell. What a driven robot has and its
+model lacks lies mostly in its few inputs: chambers made by hand differ, creep, and act on each
+other. So the effective inputs are the identified response x to the commands and a network f of x
+and its exponential means (`InputNetwork`).
 
-The first weights come from linearised motions: the paper's equation 6, which changes a simulated motion as little as
-possible to bring it to the markers, with the force restricted to what the inputs can do. A roll-out also gives the
-derivatives J of its points p by lasting changes of the inputs, and a kernel k with which points follow changes in time
-(`linearised`). With the change d of the inputs by the networks, the weights w minimise
+The first weights come from linearised motions: the paper's equation 6, which changes a simulated
+motion as little as possible to bring it to the markers, with the force restricted to what the
+inputs can do. A roll-out also gives the derivatives J of its points p by lasting changes of the
+inputs, and a kernel k with which points follow changes in time (`linearised`). With the change d of
+the inputs by the networks, the weights w minimise
 
     sum |p + J (k * d) - y|^2 + trust |d|^2 + penalty |w|^2.
 
-An epoch is a roll-out with these derivatives and this minimum, with the least trust for which the motions come closer
-(Levenberg and Marquardt). The first one chooses the penalty, by the errors of linearised motions that are left out in
-turn.
+An epoch is a roll-out with these derivatives and this minimum, with the least trust for which the
+motions come closer (Levenberg and Marquardt). The first one chooses the penalty, by the errors of
+linearised motions that are left out in turn.
 """
 
 import copy
@@ -46,8 +48,10 @@ from .training import Snapshot, run_epochs
 
 log = logging.getLogger(__name__)
 
-_OTHERS: Final = frozenset({*HUNG, *(quantity.name for quantity in MOTION)})  # inputs that drive no actuator
-_NEAR: Final = (math.inf, 0.1, 0.03)  # changes of the inputs that are tried in a round, of the largest input
+# Inputs that drive no actuator.
+_OTHERS: Final = frozenset({*HUNG, *(quantity.name for quantity in MOTION)})
+# Changes of the inputs that are tried in a round, of the largest input.
+_NEAR: Final = (math.inf, 0.1, 0.03)
 
 
 @checks_types
@@ -66,14 +70,14 @@ def fit_actuator(
         simulator: to correct.
         motions: observed states or markers, under inputs.
         train: names of the trials to learn from; by default all that are not in `validation`.
-        validation: names of the trials that choose the weights and test the result; a third of the training trials in
-            turn if there are none, or one static pose.
+        validation: names of the trials that choose the weights and test the result; a third of the
+            training trials in turn if there are none, or one static pose.
         parameters: as for `reconstruct`.
         settings: size and training; the defaults of the class if None.
 
     Returns:
-        The parameters with the actuator, to pass on as ``parameters`` of `reconstruct`, `fit_force` and `evaluate`, and
-        its test on held-out trials.
+        The parameters with the actuator, to pass on as ``parameters`` of `reconstruct`, `fit_force`
+        and `evaluate`, and its test on held-out trials.
 
     Raises:
         InputError: no trial of the training has inputs, or the body takes none.
@@ -82,7 +86,9 @@ def fit_actuator(
     others = [name for name in motions.trials.names if name not in validation]
     motions.need_points("an actuator")
     train = motions.trials.chosen(others if train is None else train)
-    fitting = ActuatorFitting(simulator, motions, train, tuple(validation), Identified.of(parameters))
+    fitting = ActuatorFitting(
+        simulator, motions, train, tuple(validation), Identified.of(parameters)
+    )
     return fitting.fit(settings or ActuatorSettings())[0]
 
 
@@ -117,7 +123,8 @@ class ActuatorFitting:
             settings: of the network and the training.
             name: displayed beside the progress bar.
             resumed: a snapshot from which an interrupted training goes on.
-            save: is called with a snapshot every ten seconds, and when the training ends or is interrupted.
+            save: is called with a snapshot every ten seconds, and when the training ends or is
+                interrupted.
 
         Returns:
             The parameters with the actuator and its test, and ``training`` as of `Learned`.
@@ -134,38 +141,64 @@ class ActuatorFitting:
         run_epochs(name, trainer, save)
         found = replace(self.identified, actuator=trainer.use_best().requires_grad_(False).inputs)
         if test is None and settings.gate:
-            names, split = self.validation or self.train, "validation" if self.validation else "training"
-            errors, below = (self._rolled_out(identified, names) for identified in (found, self.identified))
+            names = self.validation or self.train
+            split = "validation" if self.validation else "training"
+            errors, below = (
+                self._rolled_out(identified, names) for identified in (found, self.identified)
+            )
             test = self._tested(self._in_batches(names), split, errors, below)
         test = test if settings.gate else None
         if test is not None and not test["used"]:
             log.warning("%s: the learned actuator is no clear gain: %s", name, text_of(test))
         error = trainer.best_error if math.isfinite(trainer.best_error) else None
-        kept = {"selection": trainer.selection, "epoch": trainer.best_epoch, "validation_rollout_error_mm": error}
-        return replace(found, test=test), {"kept": {**kept, "test": test}, "epochs": trainer.history}
+        kept = {
+            "selection": trainer.selection,
+            "epoch": trainer.best_epoch,
+            "validation_rollout_error_mm": error,
+        }
+        return replace(found, test=test), {
+            "kept": {**kept, "test": test},
+            "epochs": trainer.history,
+        }
 
     def _folds(self) -> list[tuple[str, ...]]:
-        """Names of training trials that are left out of a fit together, as long as others have inputs."""
+        """Names of training trials that are left out of a fit together,
+        as long as others have inputs.
+        """
         trials, inputs = self.motions.trials, self.motions.trials.inputs.values()
-        driven = {n for n in self.train if any(values[trials.names.index(n)].any() for values in inputs)}
+        driven = {
+            n for n in self.train if any(values[trials.names.index(n)].any() for values in inputs)
+        }
         folds = left_out_in_turn(trials, self.train, self.validation)
         return [fold for fold in folds if driven.difference(fold)]
 
     def _held_out(
         self, folds: Sequence[tuple[str, ...]], settings: ActuatorSettings, name: str
     ) -> tuple[int, HeldOutTest]:
-        """Number of epochs with the smallest error on trials that are left out in turn, and the test on these."""
+        """Number of epochs with the smallest error on trials
+        that are left out in turn, and the test on these.
+        """
         trainers = [
-            self._trainer([one for one in self.train if one not in fold], fold, settings.changed(rollout_every=1))
+            self._trainer(
+                [one for one in self.train if one not in fold],
+                fold,
+                settings.changed(rollout_every=1),
+            )
             for fold in folds
         ]
-        with Progress(f"{name}: held out", len(folds) * settings.epochs, "epochs at most") as progress:
+        with Progress(
+            f"{name}: held out", len(folds) * settings.epochs, "epochs at most"
+        ) as progress:
             epochs, (below, errors) = cross_validated_epochs(trainers, progress.advance)
         names = [one for fold in folds for one in self._in_batches(fold)]
         return epochs, self._tested(names, HELD_OUT, errors, below)
 
     def _trainer(
-        self, names: Sequence[str], judged: Sequence[str], settings: ActuatorSettings, epochs: int | None = None
+        self,
+        names: Sequence[str],
+        judged: Sequence[str],
+        settings: ActuatorSettings,
+        epochs: int | None = None,
     ) -> "LinearisedTrainer":
         """Training of a new actuator on some trials, judged on others."""
         replays, values = self._replays(names), self.identified.values(self.simulator)
@@ -186,25 +219,37 @@ class ActuatorFitting:
         return [name for batch in self.motions.trials.batches(names) for name in batch]
 
     def _tested(
-        self, names: Sequence[str], split: str, errors: Sequence[FloatArray], below: Sequence[FloatArray]
+        self,
+        names: Sequence[str],
+        split: str,
+        errors: Sequence[FloatArray],
+        below: Sequence[FloatArray],
     ) -> HeldOutTest:
         """Compares the errors (T,) of trials [mm] with those without the actuator."""
-        sizes = [1e3 * float(self.motions.batch([name], self.simulator).amplitude) for name in names]
+        sizes = [
+            1e3 * float(self.motions.batch([name], self.simulator).amplitude) for name in names
+        ]
         return held_out_test(names, split, errors, below, sizes)
 
     def _rolled_out(self, identified: Identified, names: Sequence[str]) -> list[FloatArray]:
         """Mean distances (T,) by frame of trials [mm], in the order of their batches."""
-        counting = replace(self.simulator, solver=self.simulator.settings.changed(on_failure="count"))
+        counting = replace(
+            self.simulator, solver=self.simulator.settings.changed(on_failure="count")
+        )
         return HeldOutRollouts(counting, self.motions, names, identified).errors(None)
 
     def _loss(self, names: Sequence[str]) -> MotionLoss:
         return self._loss_of(self._replays(names))
 
     def _loss_of(self, replays: Sequence[tuple[Replay, Start]]) -> MotionLoss:
-        return MotionLoss([TrialGroup(*pair) for pair in replays], self.identified.values(self.simulator))
+        return MotionLoss(
+            [TrialGroup(*pair) for pair in replays], self.identified.values(self.simulator)
+        )
 
     def _replays(self, names: Sequence[str]) -> list[tuple[Replay, Start]]:
-        """Replays of the frames that are learned from, one for each batch of trials, each with its start."""
+        """Replays of the frames that are learned from,
+        one for each batch of trials, each with its start.
+        """
         replays = self.motions.replays(self.simulator, names, self.identified)
         return [(self.motions.learned(replay), start) for replay, start in replays]
 
@@ -242,18 +287,23 @@ class LinearisedTrainer(JudgedTrainer[Actuator]):
     @property
     @override
     def finished(self) -> bool:
-        """Whether all epochs are done, or the last one found no weights with which the motions come closer."""
+        """Whether all epochs are done, or the last one found no weights
+        with which the motions come closer.
+        """
         return super().finished or not self._near
 
     @override
     def _run_epoch(self) -> dict[str, float]:
         self.begin()
-        least, before = self.history[-1]["train_loss"], copy.deepcopy(self.model.network.state_dict())
+        least = self.history[-1]["train_loss"]
+        before = copy.deepcopy(self.model.network.state_dict())
         if not self._near:
             return {"train_loss": least}
         pairs = zip(self._replays, self._felt, strict=True)
         try:
-            linearised = [Linearised.of(*pair, self._values, self.model, felt) for pair, felt in pairs]
+            linearised = [
+                Linearised.of(*pair, self._values, self.model, felt) for pair, felt in pairs
+            ]
         except ConvergenceError as error:
             log.info("the actuator stays as it is: %s", error)
             self._near.clear()
@@ -277,7 +327,10 @@ class LinearisedTrainer(JudgedTrainer[Actuator]):
     @override
     def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
         super().resume(tensors, metadata)
-        self._near, self.penalty = list(_NEAR[len(_NEAR) - metadata["bounds"] :]), metadata["penalty"]
+        self._near, self.penalty = (
+            list(_NEAR[len(_NEAR) - metadata["bounds"] :]),
+            metadata["penalty"],
+        )
 
     def _value(self) -> float:
         """Loss and penalty; infinite where the simulation or the weights fail."""
@@ -293,7 +346,8 @@ class LinearisedTrainer(JudgedTrainer[Actuator]):
 def felt_inputs(
     replay: Replay, parameters: Mapping[str, torch.Tensor], filters: Sequence[float]
 ) -> dict[str, torch.Tensor]:
-    """Returns inputs and their means (K + 1, R, C (1 + F)) by input, at the steps of trials, first before these.
+    """Returns inputs and their means (K + 1, R, C (1 + F)) by input,
+    at the steps of trials, first before these.
 
     Args:
         replay: of the R trials.
@@ -319,17 +373,24 @@ def felt_inputs(
         first = with_means(before, [before] * len(filters))
         felt[name] = torch.cat([first[None], with_means(*response(memory, acting)[:2])])
     if not felt:
-        raise InputError(f"the trials {', '.join(replay.trials.names)} have no inputs whose actuator could be learned.")
+        raise InputError(
+            f"the trials {', '.join(replay.trials.names)} have no inputs whose actuator could be "
+            "learned."
+        )
     return felt
 
 
 def _untrained(felt: Sequence[Mapping[str, torch.Tensor]], settings: ActuatorSettings) -> Actuator:
-    """An actuator without an effect, for the values (K + 1, R, C (1 + F)) of some batches of trials by input."""
+    """An actuator without an effect, for the values (K + 1, R, C (1 + F))
+    of some batches of trials by input.
+    """
     networks = {}
     for name in felt[0]:
         values = torch.cat([batch[name].flatten(0, 1) for batch in felt])
         if bool(values.any()):
             networks[name] = InputNetwork.of_training(values, settings.filters, settings.centres)
     if not networks:
-        raise InputError("all inputs of the training trials are zero: name trials in which the robot is driven.")
+        raise InputError(
+            "all inputs of the training trials are zero: name trials in which the robot is driven."
+        )
     return Actuator(networks).to(next(iter(felt[0].values())).device)

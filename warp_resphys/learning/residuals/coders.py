@@ -1,4 +1,4 @@
-"""Affine maps between fields on the vertices and standardised coordinates, from training samples."""
+"""Affine maps between fields on vertices and standardised coordinates, from training samples."""
 
 import torch
 from torch import nn
@@ -6,14 +6,17 @@ from torch import nn
 from ...dynamics.modes import RestStiffness
 from ...io.errors import InputError
 
-# Modes and coordinates that vary less than this fraction of the largest are not amplified to unit deviation.
+# Modes and coordinates that vary less than this fraction of the largest are not amplified to unit
+# deviation.
 _DEVIATION_FLOOR = 3e-3
-# Evenly spaced samples for modes: neighbours in time are nearly equal, and more samples take minutes.
+# Evenly spaced samples for modes: neighbours in time are nearly equal, and more samples take
+# minutes.
 _SAMPLES_FOR_MODES = 2_000
 
 
 class Coder(nn.Module):
-    """An affine map between a field on the vertices and standardised coordinates: c = (x - mean) basis / scale.
+    """An affine map between a field on the vertices and standardised coordinates:
+    c = (x - mean) basis / scale.
 
     Its constants are in double precision, as the states of simulations.
 
@@ -21,7 +24,8 @@ class Coder(nn.Module):
         mean: (D,) flattened field at c = 0.
         basis: (D, M) columns; None for the coordinates themselves.
         scale: (M,) standard deviation of each coordinate.
-        dual: (D, M) columns that decode fields, with dual^T basis = 1; None for an orthonormal basis, its own dual.
+        dual: (D, M) columns that decode fields, with dual^T basis = 1; None for an orthonormal
+            basis, its own dual.
     """
 
     mean: torch.Tensor
@@ -30,7 +34,11 @@ class Coder(nn.Module):
     dual: torch.Tensor | None
 
     def __init__(
-        self, mean: torch.Tensor, basis: torch.Tensor | None, scale: torch.Tensor, dual: torch.Tensor | None = None
+        self,
+        mean: torch.Tensor,
+        basis: torch.Tensor | None,
+        scale: torch.Tensor,
+        dual: torch.Tensor | None = None,
     ) -> None:
         super().__init__()
         for name, values in (("mean", mean), ("basis", basis), ("scale", scale), ("dual", dual)):
@@ -55,7 +63,8 @@ class Coder(nn.Module):
 
 
 def pod_coder(samples: torch.Tensor, modes: int) -> Coder:
-    """Proper orthogonal decomposition about zero: the M modes with most of the energy of samples (S, N, 3).
+    """Proper orthogonal decomposition about zero: the M modes
+    with most of the energy of samples (S, N, 3).
 
     Raises:
         InputError: more modes than samples or coordinates, or samples that are all zero.
@@ -63,15 +72,21 @@ def pod_coder(samples: torch.Tensor, modes: int) -> Coder:
     x = _thinned(samples).flatten(1).double()
     if not bool(x.any()):
         raise InputError(
-            f"{modes} modes were asked for of a field that is zero in all {len(x)} samples, such as the velocities of "
-            "poses: set that number of modes to 0."
+            f"{modes} modes were asked for of a field that is zero in all {len(x)} samples, such "
+            "as the velocities of poses: set that number of modes to 0."
         )
     if not 1 <= modes <= min(x.shape):
-        raise InputError(f"{modes} modes were asked for, but {len(x)} samples give 1 to {min(x.shape)}.")
+        raise InputError(
+            f"{modes} modes were asked for, but {len(x)} samples give 1 to {min(x.shape)}."
+        )
     _, _, directions = torch.linalg.svd(x, full_matrices=False)
     basis = directions[:modes].mT.contiguous()
     deviation = (x @ basis).square().mean(0).sqrt()
-    return Coder(torch.zeros_like(x[0]), basis, deviation.clamp_min(_DEVIATION_FLOOR * float(deviation.max())))
+    return Coder(
+        torch.zeros_like(x[0]),
+        basis,
+        deviation.clamp_min(_DEVIATION_FLOOR * float(deviation.max())),
+    )
 
 
 def _thinned(samples: torch.Tensor) -> torch.Tensor:
@@ -80,11 +95,11 @@ def _thinned(samples: torch.Tensor) -> torch.Tensor:
 
 
 def displacement_coder(samples: torch.Tensor, stiffness: RestStiffness, modes: int) -> Coder:
-    """Coder of forces in the modes Psi of their static displacements: f = K Psi c and c = Psi^T K^-1 f.
+    """Coder of forces in modes Psi of their static displacements: f = K Psi c and c = Psi^T K^-1 f.
 
-    A slender body is moved most by small forces, while large ones cancel. In modes of the forces themselves, a small
-    error of a large force moves the body further than the small forces do. In modes of K^-1 f, the error of a
-    coordinate is the error of the displacement.
+    A slender body is moved most by small forces, while large ones cancel. In modes of the forces
+    themselves, a small error of a large force moves the body further than the small forces do. In
+    modes of K^-1 f, the error of a coordinate is the error of the displacement.
 
     Args:
         samples: (S, N, 3) forces [N].
@@ -95,11 +110,16 @@ def displacement_coder(samples: torch.Tensor, stiffness: RestStiffness, modes: i
         InputError: more modes than samples or coordinates.
     """
     forces = _thinned(samples).flatten(1).double()
-    displacements = torch.as_tensor(stiffness.displacements(forces.cpu().numpy().T).T.copy()).to(forces)
+    displacements = torch.as_tensor(stiffness.displacements(forces.cpu().numpy().T).T.copy()).to(
+        forces
+    )
     coder = pod_coder(displacements.unflatten(1, (-1, 3)), modes)
     assert coder.basis is not None
     psi = coder.basis.cpu().numpy()
-    basis, dual = (torch.as_tensor(part).to(forces) for part in (stiffness.displacements(psi), stiffness.forces(psi)))
+    basis, dual = (
+        torch.as_tensor(part).to(forces)
+        for part in (stiffness.displacements(psi), stiffness.forces(psi))
+    )
     return Coder(torch.zeros_like(forces[0]), basis, coder.scale, dual)
 
 
@@ -110,10 +130,15 @@ def actuation_coder(samples: torch.Tensor) -> Coder:
 
 
 def nodal_coder(samples: torch.Tensor) -> Coder:
-    """Coder that standardises every coordinate of (S, N, 3), as published; constant coordinates are zero."""
+    """Coder that standardises every coordinate of (S, N, 3), as published.
+
+    Constant coordinates are zero.
+    """
     x = samples.flatten(1)
     deviation = x.std(0)
-    return Coder(x.mean(0), None, torch.where(deviation > 0.0, deviation, torch.ones_like(deviation)))
+    return Coder(
+        x.mean(0), None, torch.where(deviation > 0.0, deviation, torch.ones_like(deviation))
+    )
 
 
 def empty_coder(samples: torch.Tensor) -> Coder:

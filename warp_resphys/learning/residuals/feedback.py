@@ -21,9 +21,12 @@ from .correction import acts_of
 log = logging.getLogger(__name__)
 
 _ITERATIONS = 50
-_AIMS = {torch.float64: 1e-11, torch.float32: 1e-8}  # change of positions at which the iteration ends [m]
+# Change of positions at which the iteration ends [m].
+_AIMS = {torch.float64: 1e-11, torch.float32: 1e-8}
 _TOLERANCE = 1e-8  # change of positions that is enough where they come no closer [m]
-_PATIENCE = 20  # iterations without progress, after which the search ends; of positions that rest, a few
+_PATIENCE = (
+    20  # iterations without progress, after which the search ends; of positions that rest, a few
+)
 _MEMORY = 6  # iterations that are combined
 _RIDGE = 1e-12
 _MOST_STEPS = 300  # of a motion after which a body must nearly rest
@@ -32,17 +35,23 @@ _SETTLED = 1e-9  # relative residual of a gradient
 
 
 def equilibrium_under_feedback(
-    simulator: Simulator, inputs: Inputs, constants: Constants, guess: State, predict: Callable[[State, int], Any]
+    simulator: Simulator,
+    inputs: Inputs,
+    constants: Constants,
+    guess: State,
+    predict: Callable[[State, int], Any],
 ) -> State:
-    """Returns the state of rest under constant inputs and a force (B, N, 3) [N] that depends on the state.
+    """Returns the state of rest under constant inputs and a force (B, N, 3) [N]
+    that depends on the state.
 
-    It is the fixed point of equilibria under constant forces. Each iteration evaluates the force, solves the
-    equilibrium under it and accelerates the sequence of positions. It ends when no position moves by more than
-    1e-11 m, in single precision 1e-8 m, or at once where the force does not depend on the positions. Where the
-    iteration stalls, the body first moves until it nearly rests.
+    It is the fixed point of equilibria under constant forces. Each iteration evaluates the force,
+    solves the equilibrium under it and accelerates the sequence of positions. It ends when no
+    position moves by more than 1e-11 m, in single precision 1e-8 m, or at once where the force does
+    not depend on the positions. Where the iteration stalls, the body first moves until it nearly
+    rests.
 
-    For a loss with the gradient w by the fixed point x = S(x), that by what S depends on besides x is that of S for
-    g = w + (dS/dx)^T g.
+    For a loss with the gradient w by the fixed point x = S(x), that by what S depends on besides x
+    is that of S for g = w + (dS/dx)^T g.
 
     Args:
         simulator: of the body.
@@ -52,7 +61,8 @@ def equilibrium_under_feedback(
         predict: predictor of the force, called with step zero.
 
     Raises:
-        ConvergenceError: there is no equilibrium, or none is found; the report says which environments rest, (B,).
+        ConvergenceError: there is no equilibrium, or none is found; the report says which
+            environments rest, (B,).
     """
     problem = _Feedback(simulator, inputs, constants, predict)
     with torch.no_grad():
@@ -61,11 +71,14 @@ def equilibrium_under_feedback(
             try:
                 found, rests = problem.iterate(problem.relaxed(found))
             except ConvergenceError:
-                log.debug("the body does not come to rest: a step or an equilibrium on the way failed")
+                log.debug(
+                    "the body does not come to rest: a step or an equilibrium on the way failed"
+                )
     if not bool(rests.all()):
         count = f"{int((~rests).sum())} of {len(rests)} poses"
         raise ConvergenceError(
-            f"{count} and the force that depends on them did not settle: the force is too large to be a correction.",
+            f"{count} and the force that depends on them did not settle: the force is too large "
+            "to be a correction.",
             found.q,
             rests,
         )
@@ -88,7 +101,11 @@ class _Feedback:
     """Equilibria under forces of given states (arguments: `equilibrium_under_feedback`)."""
 
     def __init__(
-        self, simulator: Simulator, inputs: Inputs, constants: Constants, predict: Callable[[State, int], Any]
+        self,
+        simulator: Simulator,
+        inputs: Inputs,
+        constants: Constants,
+        predict: Callable[[State, int], Any],
     ) -> None:
         self._simulator, self._inputs, self._constants = simulator, inputs, constants
         self._predict, self._acts = predict, acts_of(predict)
@@ -104,7 +121,9 @@ class _Feedback:
         return self._simulator.static_equilibrium(acting, self._constants, start=state.q.detach())
 
     def iterate(self, state: State) -> tuple[State, torch.Tensor]:
-        """Returns the equilibria that changed least in the iteration, and (B,) bool, which environments rest there."""
+        """Returns the equilibria that changed least in the iteration,
+        and (B,) bool, which environments rest there.
+        """
         acceleration, stalled = _AndersonAcceleration(), 0
         best = solution = state
         smallest = state.q.new_full((state.batch,), torch.inf)
@@ -128,7 +147,9 @@ class _Feedback:
         return best, smallest < _TOLERANCE
 
     def relaxed(self, state: State) -> State:
-        """Returns the state in which the body rests after moving under the force, or the last one."""
+        """Returns the state in which the body rests
+        after moving under the force, or the last one.
+        """
         moving = replace(self._simulator, integrator="implicit_euler")
         state = State(state.q, torch.zeros_like(state.q))
         for number in range(_MOST_STEPS):
@@ -141,7 +162,9 @@ class _Feedback:
 
     @staticmethod
     def adjoint(gradient: torch.Tensor, near: torch.Tensor, again: torch.Tensor) -> torch.Tensor:
-        """Returns g = w + (dS/dx)^T g (B, N, 3), for w (B, N, 3) and S(x) at x, by GMRES, as S depends on few modes."""
+        """Returns g = w + (dS/dx)^T g (B, N, 3), for w (B, N, 3) and S(x) at x,
+        by GMRES, as S depends on few modes.
+        """
         from scipy.sparse.linalg import LinearOperator, gmres
 
         def product(values: FloatArray) -> FloatArray:
@@ -151,18 +174,23 @@ class _Feedback:
 
         right = gradient.detach().flatten().double().cpu().numpy()
         matrix = LinearOperator((right.size, right.size), matvec=product, dtype=np.float64)
-        found, unsettled = gmres(matrix, right, right, rtol=_SETTLED, restart=_ITERATIONS, maxiter=4)
+        found, unsettled = gmres(
+            matrix, right, right, rtol=_SETTLED, restart=_ITERATIONS, maxiter=4
+        )
         if unsettled:
-            raise ConvergenceError("the gradient of a pose and its force did not settle.", near.detach(), None)
+            raise ConvergenceError(
+                "the gradient of a pose and its force did not settle.", near.detach(), None
+            )
         return torch.as_tensor(found).to(near).view_as(near)
 
 
 class _AndersonAcceleration:
     """Proposes the next iterate of a fixed-point iteration, for each environment separately.
 
-    Anderson's acceleration (J. ACM 12 (1965) 547) about the iterate with the smallest change: the combination of all
-    iterates that would not change if the map were linear, plus a share of the change that remains. The share is halved
-    after an iterate with a larger change than the best one, and doubled after others.
+    Anderson's acceleration (J. ACM 12 (1965) 547) about the iterate with the smallest change: the
+    combination of all iterates that would not change if the map were linear, plus a share of the
+    change that remains. The share is halved after an iterate with a larger change than the best
+    one, and doubled after others.
     """
 
     def __init__(self) -> None:
@@ -172,7 +200,10 @@ class _AndersonAcceleration:
 
     def next(self, q: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
         """Returns the next iterate (B, N, 3), after iterate q (B, N, 3) changed by (B, N, 3)."""
-        self._iterates, self._changes = [*self._iterates, q.flatten(1)], [*self._changes, change.flatten(1)]
+        self._iterates, self._changes = (
+            [*self._iterates, q.flatten(1)],
+            [*self._changes, change.flatten(1)],
+        )
         x, f = torch.stack(self._iterates), torch.stack(self._changes)  # (m, B, 3 N)
         size = f.norm(dim=2)
         best = size.argmin(0)
@@ -191,6 +222,8 @@ class _AndersonAcceleration:
         gram = df @ df.mT
         trace = torch.diagonal(gram, dim1=1, dim2=2).sum(1)
         ridge = torch.where(trace > 0.0, _RIDGE * trace, 1.0)[:, None, None]
-        weights = torch.linalg.solve(gram + ridge * torch.eye(gram.shape[1]).to(gram), df @ f_best[..., None])
+        weights = torch.linalg.solve(
+            gram + ridge * torch.eye(gram.shape[1]).to(gram), df @ f_best[..., None]
+        )
         remaining = f_best - (df.mT @ weights)[..., 0]
         return (x_best - (dx.mT @ weights)[..., 0] + self._share * remaining).view_as(q)

@@ -18,7 +18,12 @@ from ...io.arrays import FloatArray
 from ...io.errors import InputError, checks_types
 from ...io.progress import Progress
 from ...io.settings import parse
-from ...settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings, TrainingSettings
+from ...settings.learning import (
+    InTheLoopSettings,
+    NetworkSettings,
+    TrainerSettings,
+    TrainingSettings,
+)
 from ..acceptance import Acceptance
 from ..evaluation import HELD_OUT, HeldOutRollouts, left_out_in_turn
 from ..observed_motions import Identified, ObservedMotions
@@ -33,7 +38,8 @@ from .training import EpochTrainer, Samples, Snapshot, Trainer, run_epochs
 
 log = logging.getLogger(__name__)
 
-Prepared = tuple[EpochTrainer[Any], Learned]  # a trainer, ready to run, and its network with settings of roll-outs
+# a trainer, ready to run, and its network with settings of roll-outs
+Prepared = tuple[EpochTrainer[Any], Learned]
 
 
 @checks_types
@@ -58,8 +64,8 @@ def fit_force(
         motions: observed states or markers.
         reconstructed: from `reconstruct`.
         train: names of the trials to learn from; by default all that are not in `validation`.
-        validation: names of the trials that choose the weights, by the error of their roll-outs; the training trials if
-            empty.
+        validation: names of the trials that choose the weights, by the error of their roll-outs;
+            the training trials if empty.
         parameters: as for `reconstruct`.
         network: kind and size; the defaults of the class if None.
         trainer: epochs, rates and noise of training on steps; the defaults of the class if None.
@@ -68,8 +74,8 @@ def fit_force(
         more: further attributes of `Fitting`.
 
     Returns:
-        The network, to pass to `evaluate`. It maps q (S, N, 3) [m], v (S, N, 3) [m/s] and the inputs (S, A) to forces
-        (S, N, 3) [N].
+        The network, to pass to `evaluate`. It maps q (S, N, 3) [m], v (S, N, 3) [m/s] and the
+        inputs (S, A) to forces (S, N, 3) [N].
 
     Raises:
         InputError: sizes, or a number of reconstructed steps, that do not fit the motions.
@@ -77,7 +83,15 @@ def fit_force(
     others = [name for name in motions.trials.names if name not in validation]
     motions.need_points("a force")
     train = motions.trials.chosen(others if train is None else train)
-    fitting = Fitting(simulator, motions, reconstructed, train, tuple(validation), Identified.of(parameters), **more)
+    fitting = Fitting(
+        simulator,
+        motions,
+        reconstructed,
+        train,
+        tuple(validation),
+        Identified.of(parameters),
+        **more,
+    )
     groups = {"network": network or NetworkSettings(), "trainer": trainer or TrainerSettings()}
     settings = parse(TrainingSettings, {**groups, "in_the_loop": in_the_loop, "seed": seed})
     with torch.random.fork_rng():
@@ -86,12 +100,14 @@ def fit_force(
 
 @dataclass(frozen=True)
 class Fitting:
-    """Data of a fit: the simulator, the trials, their reconstructed forces, and options of the roll-outs.
+    """Data of a fit: the simulator, the trials, their reconstructed forces,
+    and options of the roll-outs.
 
     Attributes:
         simulator: whose force is learned, or which shows the network's states.
         motions: observed trials.
-        reconstructed: their states and forces; None where the trials have the states of all vertices.
+        reconstructed: their states and forces; None where the trials have the states of all
+            vertices.
         train: names of the trials to learn from.
         validation: names of the trials that choose the weights.
         identified: parameters of the simulator.
@@ -100,7 +116,8 @@ class Fitting:
         range_guard: whether roll-outs clamp the network's inputs to their range in training.
         fades: whether the force fades out beyond that range.
         device: of the training.
-        coded: names of the trials whose states and forces give the modes of the network; those of `train` if None.
+        coded: names of the trials whose states and forces give the modes of the network; those of
+            `train` if None.
     """
 
     simulator: Simulator
@@ -119,11 +136,13 @@ class Fitting:
     def samples(self, names: Sequence[str]) -> Samples:
         """Collects the single steps of trials; a static pose is one step without motion.
 
-        States are in the frame of the base. The output is the force during the step, rotated to the rest shape if
-        forces are corotated, or the displacement and velocity at the end of the step. Steps without any visible marker
-        are left out.
+        States are in the frame of the base. The output is the force during the step, rotated to the
+        rest shape if forces are corotated, or the displacement and velocity at the end of the step.
+        Steps without any visible marker are left out.
         """
-        samples = Samples.joined([self._samples(batch) for batch in self.motions.trials.batches(names)])
+        samples = Samples.joined(
+            [self._samples(batch) for batch in self.motions.trials.batches(names)]
+        )
         frames = None if self.data_driven else force_frames(self.simulator, self.force_frame)
         if frames is None:
             return samples
@@ -137,19 +156,30 @@ class Fitting:
             pairs = enumerate(zip(q.unbind(1), v.unbind(1), strict=True))
             inside = [base.enter(x.to(like), w.to(like), k) for k, (x, w) in pairs]
             q, v = (torch.stack(field, 1).to(q) for field in zip(*inside, strict=True))
-            forces = enumerate(force.unbind(1))  # The force of a frame belongs to the previous step.
-            force = torch.stack([base.force_inside(f.to(like), k - 1) for k, f in forces], 1).to(force)
+            # The force of a frame belongs to the previous step.
+            forces = enumerate(force.unbind(1))
+            force = torch.stack([base.force_inside(f.to(like), k - 1) for k, f in forces], 1).to(
+                force
+            )
         if self.motions.trials.begin_of(names[0]) == STATIC:
-            q, v, force, seen = q[:, 1:2].expand(-1, 2, -1, -1), torch.zeros_like(v[:, :2]), force[:, :2], seen[:, :1]
+            q = q[:, 1:2].expand(-1, 2, -1, -1)
+            v = torch.zeros_like(v[:, :2])
+            force = force[:, :2]
+            seen = seen[:, :1]
         steps, whole = q.shape[1] - 1, bool(seen.all())
 
         def pick(field: torch.Tensor) -> torch.Tensor:
             return field.flatten(0, 1) if whole else field[seen]
 
-        values, replay = self.identified.values(self.simulator), self.motions.replay(self.simulator, names)
+        values = self.identified.values(self.simulator)
+        replay = self.motions.replay(self.simulator, names)
         inputs = self.motions.conditions(replay, values, self.data_driven)
         if inputs is not None:  # (K, R, A), or (R, A) constant in time
-            inputs = inputs[:steps].swapaxes(0, 1) if inputs.ndim == 3 else inputs[:, None].expand(-1, steps, -1)
+            inputs = (
+                inputs[:steps].swapaxes(0, 1)
+                if inputs.ndim == 3
+                else inputs[:, None].expand(-1, steps, -1)
+            )
             inputs = pick(inputs.expand(-1, steps, -1).to(self.device))
         now = pick(q[:, :-1]), pick(v[:, :-1])
         if not self.data_driven:
@@ -157,47 +187,75 @@ class Fitting:
         return Samples(*now, (pick(q[:, 1:]) - like.to(q), pick(v[:, 1:])), inputs)
 
     def _states(self, names: Sequence[str]) -> tuple[torch.Tensor, ...]:
-        """Positions, velocities and forces (R, K + 1, N, 3) of trials, and (R, K) whether steps were seen.
+        """Positions, velocities and forces (R, K + 1, N, 3) of trials,
+        and (R, K) whether steps were seen.
 
-        States are the reconstructed ones; for next states, those of the trials themselves, with zero forces, if known.
+        States are the reconstructed ones; for next states, those of the trials themselves, with
+        zero forces, if known.
         """
         trials = self.motions.trials
         if self.data_driven and trials.velocity is not None:
             rows = trials.rows(names)
-            q, v = (torch.as_tensor(field[rows], device=self.device) for field in (trials.observed, trials.velocity))
-            return q, v, q.new_zeros(()).expand_as(q), torch.ones(len(q), q.shape[1] - 1, dtype=torch.bool)
+            q, v = (
+                torch.as_tensor(field[rows], device=self.device)
+                for field in (trials.observed, trials.velocity)
+            )
+            return (
+                q,
+                v,
+                q.new_zeros(()).expand_as(q),
+                torch.ones(len(q), q.shape[1] - 1, dtype=torch.bool),
+            )
         if self.reconstructed is None:
-            raise InputError("the trials have no velocities of all vertices to learn from: reconstruct them first.")
+            raise InputError(
+                "the trials have no velocities of all vertices to learn from: "
+                "reconstruct them first."
+            )
         arrays = self.reconstructed.of(names, "q", "v", "force", "error")
         if (given := arrays[0].shape[2]) != (wanted := len(self.simulator.rest_positions)):
-            raise InputError(f"forces on {given} vertices were reconstructed, but the body has {wanted}: do so for it.")
+            raise InputError(
+                f"forces on {given} vertices were reconstructed, "
+                f"but the body has {wanted}: do so for it."
+            )
         q, v, force, error = (torch.as_tensor(array, device=self.device) for array in arrays)
         steps = None if self.data_driven else self._steps(names)
         if steps is not None and len(q[0]) != steps + 1:
             raise InputError(
-                f"forces of {len(q[0]) - 1} steps were reconstructed, but {names[0]} has {steps} of "
-                f"{1e3 * self.simulator.time_step:g} ms: do so with this simulator and these motions."
+                f"forces of {len(q[0]) - 1} steps were reconstructed, but {names[0]} has {steps} "
+                f"of {1e3 * self.simulator.time_step:g} ms: "
+                "do so with this simulator and these motions."
             )
         return q, v, force, error[:, 1:].isfinite()
 
     def _steps(self, names: Sequence[str]) -> int | None:
-        """Number of steps of trials that are learned from; None if delays, smoothing or other trials determine it."""
+        """Number of steps of trials that are learned from.
+
+        None if delays, smoothing or other trials determine it.
+        """
         trials, release = self.motions.trials, self.motions.release
         begins = trials.begin_of(names[0])
-        exact = begins == GIVEN or (begins in RESTING and trials.smoothed is None and release.delay == 0.0)
+        exact = begins == GIVEN or (
+            begins in RESTING and trials.smoothed is None and release.delay == 0.0
+        )
         lengths = {trials.seconds([name]) for name in trials.names}
         if not exact or len(lengths) > 1:
             return None
         return self.motions.learned_steps(int(lengths.pop() / self.simulator.time_step + 1e-6))
 
     def new_network(self, train: Samples, settings: TrainingSettings) -> StateMap:
-        """Makes an untrained network with coders fitted to the training steps, deterministic for a seed."""
+        """Makes an untrained network with coders fitted to the training steps,
+        deterministic for a seed.
+        """
         rest, network = self.simulator.rest_positions.to(train.q.device), settings.network
         train = train if self.coded is None else self.samples(self.coded)
         if not self.motions.trials.moving(self.coded or self.train):
             network = self._limited(network, len(train.q))
         torch.manual_seed(settings.seed)
-        by_displacement = not self.data_driven and network.kind == "reduced" and network.force_basis == "displacement"
+        by_displacement = (
+            not self.data_driven
+            and network.kind == "reduced"
+            and network.force_basis == "displacement"
+        )
         stiffness = RestStiffness(self.simulator) if by_displacement else None
         force = None if self.data_driven else train.outputs[0]
         kind = NextState if self.data_driven else ResidualForce
@@ -228,13 +286,19 @@ class Fitting:
         return self._on_steps(samples, settings)
 
     def _on_steps(self, train: Samples, settings: TrainingSettings) -> Prepared:
-        """Prepares training on single steps, validated by roll-outs: of the training trials without others."""
+        """Prepares training on single steps, validated by roll-outs:
+        of the training trials without others.
+        """
         judged = self.validation or self.train
         validation = self.samples(judged) if self.validation else train
         network = self.new_network(train, settings)
         learned = Learned(network, self._range_of(network, train), self.force_frame)
-        counting = replace(self.simulator, solver=self.simulator.settings.changed(on_failure="count"))
-        rollouts = HeldOutRollouts(counting, self.motions, judged, self.identified, self.data_driven)
+        counting = replace(
+            self.simulator, solver=self.simulator.settings.changed(on_failure="count")
+        )
+        rollouts = HeldOutRollouts(
+            counting, self.motions, judged, self.identified, self.data_driven
+        )
 
         def judge(weights: StateMap) -> float:
             return rollouts.error_mm(replace(learned, network=weights))
@@ -242,7 +306,10 @@ class Fitting:
         return Trainer(network, train, validation, judge, settings.trainer, settings.seed), learned
 
     def _range_of(self, network: StateMap, train: Samples) -> Range | None:
-        """Training range of a network's inputs, to which roll-outs clamp them; None without a guard."""
+        """Training range of a network's inputs, to which roll-outs clamp them.
+
+        None without a guard.
+        """
         if not self.range_guard:
             return None
         with torch.no_grad():
@@ -254,10 +321,13 @@ class Fitting:
     ) -> Prepared:
         """Prepares training through the simulator, on whole trials.
 
-        The reconstruction provides the modes of motions and forces. Without validation trials, the number of epochs is
-        found by cross-validation, holding out each training trial once; it may be zero.
+        The reconstruction provides the modes of motions and forces. Without validation trials, the
+        number of epochs is found by cross-validation, holding out each training trial once; it may
+        be zero.
         """
-        parameters, train, validation = self.identified.values(self.simulator), self.train, self.validation
+        parameters = self.identified.values(self.simulator)
+        train = self.train
+        validation = self.validation
         replays = self.motions.replays(self.simulator, train + validation, self.identified)
 
         def loss(names: Sequence[str]) -> MotionLoss:
@@ -271,23 +341,34 @@ class Fitting:
 
         epochs, test = None, None
         if loop.hold_out and not validation and len(train) > 1:
-            each, rest = loop.changed(rollout_every=1), {out: [one for one in train if one != out] for out in train}
+            each = loop.changed(rollout_every=1)
+            rest = {out: [one for one in train if one != out] for out in train}
             parts = [InTheLoop(make_network(), loss(rest[out]), loss([out]), each) for out in train]
-            with Progress(f"{name}: held out", len(train) * loop.epochs, "epochs at most") as progress:
+            with Progress(
+                f"{name}: held out", len(train) * loop.epochs, "epochs at most"
+            ) as progress:
                 epochs, (below, errors) = cross_validated_epochs(parts, progress.advance)
             sizes = [size for part in parts for size in part.judge.amplitudes_mm()]
-            test = held_out_test(train, HELD_OUT, errors, below, sizes) if settings.trainer.gate else None
+            test = (
+                held_out_test(train, HELD_OUT, errors, below, sizes)
+                if settings.trainer.gate
+                else None
+            )
             epochs = epochs if test is None or test["used"] else 0
             log.debug("%s: %d epochs are best for held-out trials", name, epochs)
         trainer = InTheLoop(make_network(), loss(train), loss(validation or train), loop, epochs)
         trainer.begin()
-        return trainer, Learned(trainer.model, self._range_of(trainer.model, samples), self.force_frame, test=test)
+        return trainer, Learned(
+            trainer.model, self._range_of(trainer.model, samples), self.force_frame, test=test
+        )
 
     def test(self, learned: Learned, settings: TrainingSettings, name: str) -> HeldOutTest:
-        """Tests a network beside the simulator alone: on the validation trials, or on training trials in turn.
+        """Tests a network beside the simulator alone:
+        on the validation trials, or on training trials in turn.
 
-        Where validation trials do not suffice (`left_out_in_turn`), a third of the training trials that begin alike is
-        left out of a fit each time, with the modes of all; a single one is tested on itself.
+        Where validation trials do not suffice (`left_out_in_turn`), a third of the training trials
+        that begin alike is left out of a fit each time, with the modes of all; a single one is
+        tested on itself.
         """
         folds = left_out_in_turn(self.motions.trials, self.train, self.validation)
         parts = [] if folds else [(learned, self.validation or self.train)]
@@ -296,8 +377,13 @@ class Fitting:
             trainer, fitted = replace(self, train=rest, coded=self.train).trainer(settings, name)
             run_epochs(f"{name}: without {number} of {len(folds)}", trainer)
             parts.append((replace(fitted, network=trainer.use_best()), left_out))
-        counting = replace(self.simulator, solver=self.simulator.settings.changed(on_failure="count"))
-        names, errors, below, sizes = list[str](), list[FloatArray](), list[FloatArray](), list[float]()
+        counting = replace(
+            self.simulator, solver=self.simulator.settings.changed(on_failure="count")
+        )
+        names = list[str]()
+        errors = list[FloatArray]()
+        below = list[FloatArray]()
+        sizes = list[float]()
         for fitted, trials in parts:
             runs = HeldOutRollouts(counting, self.motions, trials, self.identified)
             names, sizes = names + runs.names, sizes + runs.amplitudes_mm()
@@ -306,15 +392,25 @@ class Fitting:
         return held_out_test(names, split, errors, below, sizes)
 
     def accepted(self, learned: Learned, test: HeldOutTest) -> HeldOutTest:
-        """Returns the test of a network that is accurate, refused where `Acceptance` objects to it."""
+        """Returns the test of a network that is accurate,
+        refused where `Acceptance` objects to it.
+        """
         if not test["used"]:
             return test
-        acceptance = Acceptance(self.simulator, self.motions, self.identified, test["below_mm"] or math.inf)
-        refused = acceptance.objections(learned, self.train + self.validation, self.validation or self.train)
+        acceptance = Acceptance(
+            self.simulator, self.motions, self.identified, test["below_mm"] or math.inf
+        )
+        refused = acceptance.objections(
+            learned, self.train + self.validation, self.validation or self.train
+        )
         return {**test, "used": not refused, "refused": refused}
 
     def _group(
-        self, replay: Replay, start: Start, names: Sequence[str], parameters: Mapping[str, torch.Tensor]
+        self,
+        replay: Replay,
+        start: Start,
+        names: Sequence[str],
+        parameters: Mapping[str, torch.Tensor],
     ) -> TrialGroup | None:
         """The trials of a replay that are among some; None without any."""
         batch, simulator = replay.trials.names, self.simulator
@@ -322,7 +418,8 @@ class Fitting:
         if not rows:
             return None
         part = self.motions.learned(replay.changed(trials=replay.trials.select(rows)))
-        inputs, base = self.motions.conditions(part, parameters), self.motions.base(part.trials.names, simulator)
+        inputs = self.motions.conditions(part, parameters)
+        base = self.motions.base(part.trials.names, simulator)
         frames = force_frames(simulator, self.force_frame)
         return TrialGroup(part, start.select(rows), inputs, frames, base)
 
@@ -341,7 +438,8 @@ def fit(
         settings: of the training.
         name: displayed beside the progress bar.
         resumed: a snapshot from which an interrupted training goes on.
-        save: is called with a snapshot every ten seconds, and when the training ends or is interrupted.
+        save: is called with a snapshot every ten seconds, and when the training ends or is
+            interrupted.
     """
     trainer, learned = fitting.trainer(settings, name)
     if resumed is not None:
@@ -357,5 +455,11 @@ def fit(
     test = None if test is None else fitting.accepted(learned, test)
     if test is not None and not test["used"]:
         log.warning("%s: the network is not used: %s", name, text_of(test))
-    kept = {"selection": trainer.selection, "epoch": trainer.best_epoch, "validation_rollout_error_mm": error}
-    return replace(learned, training={"kept": {**kept, "test": test}, "epochs": trainer.history}, test=test)
+    kept = {
+        "selection": trainer.selection,
+        "epoch": trainer.best_epoch,
+        "validation_rollout_error_mm": error,
+    }
+    return replace(
+        learned, training={"kept": {**kept, "test": test}, "epochs": trainer.history}, test=test
+    )

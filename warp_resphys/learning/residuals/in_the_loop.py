@@ -1,13 +1,15 @@
-"""Training of a residual force through the simulator: the loss is the error of the corrected simulator over motions.
+"""Training of a residual force through the simulator:
+the loss is the error of the corrected simulator over motions.
 
-Its gradient goes back through the implicit adjoint of every step (Um et al. 2020, "Solver-in-the-Loop").
+Its gradient goes back through the implicit adjoint of every step (Um et al. 2020,
+"Solver-in-the-Loop").
 
-An epoch is one iteration of L-BFGS with its line search. Adam's first steps move every weight by the learning rate,
-however small the gradient, which spoils a network that is nearly right; and where the loss comes from the simulator, a
-line search costs less than tuning a schedule of rates.
+An epoch is one iteration of L-BFGS with its line search. Adam's first steps move every weight by
+the learning rate, however small the gradient, which spoils a network that is nearly right; and
+where the loss comes from the simulator, a line search costs less than tuning a schedule of rates.
 
-Few recordings determine only part of a residual force. So the force starts from zero, which is the uncorrected
-simulator, and a penalty on the weights keeps it there as far as the motions allow.
+Few recordings determine only part of a residual force. So the force starts from zero, which is the
+uncorrected simulator, and a penalty on the weights keeps it there as far as the motions allow.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -57,17 +59,24 @@ class MotionLoss:
 
     Attributes:
         weights: (R,) of the squared errors of each group's trials.
-        judged: for each call of `error_mm`, the mean distances (T,) by frame of each trial [mm], NaN where it diverged.
+        judged: for each call of `error_mm`, the mean distances (T,) by frame of each trial [mm],
+            NaN where it diverged.
     """
 
-    def __init__(self, groups: Sequence[TrialGroup], parameters: Mapping[str, torch.Tensor]) -> None:
+    def __init__(
+        self, groups: Sequence[TrialGroup], parameters: Mapping[str, torch.Tensor]
+    ) -> None:
         self._groups, self._parameters, self.judged = groups, parameters, list[list[FloatArray]]()
         counts = [len(group.replay.trials.names) for group in groups]
         shares = [count / sum(counts) for count in counts]
-        self.weights = [g.replay.trials.loss_weight * share for g, share in zip(groups, shares, strict=True)]
+        self.weights = [
+            g.replay.trials.loss_weight * share for g, share in zip(groups, shares, strict=True)
+        ]
 
     def _errors(self, model: Corrects | None) -> list[Sensed]:
-        """Errors (R, T, M, 3) of markers and (R, T, S, 6) of readings of each group [m]; None: those of the simulator.
+        """Errors (R, T, M, 3) of markers and (R, T, S, 6) of readings of each group [m].
+
+        None: those of the simulator.
 
         Raises:
             ConvergenceError: the simulation fails.
@@ -75,7 +84,11 @@ class MotionLoss:
         errors = []
         for group in self._groups:
             force: Any = None
-            replay = group.replay.changed(actuator=model.inputs) if isinstance(model, Actuator) else group.replay
+            replay = (
+                group.replay.changed(actuator=model.inputs)
+                if isinstance(model, Actuator)
+                else group.replay
+            )
             if isinstance(model, ResidualForce):
                 force = LearnedPredictor(model, group.context, None, group.frames, group.base)
             points, loads = replay.sensed(group.start, self._parameters or None, force=force)
@@ -85,11 +98,16 @@ class MotionLoss:
     def __call__(self, model: Corrects | None) -> torch.Tensor:
         """Returns the loss, differentiable in the model's weights."""
         pairs = zip(self._errors(model), self.weights, strict=True)
-        squares = [(sum(x.square().sum((1, 2, 3)) for x in errors) * weight).sum() for errors, weight in pairs]
+        squares = [
+            (sum(x.square().sum((1, 2, 3)) for x in errors) * weight).sum()
+            for errors, weight in pairs
+        ]
         return torch.stack(squares).sum()
 
     def error_mm(self, model: Corrects | None) -> float:
-        """Mean distance of the seen markers, all trials with equal weight [mm]; infinite where a trial diverged.
+        """Mean distance of the seen markers, all trials with equal weight [mm].
+
+        Infinite where a trial diverged.
 
         The distances by frame are kept in `judged`.
         """
@@ -101,13 +119,19 @@ class MotionLoss:
             self.judged.append([np.full(1, np.nan) for one in seen for _ in one])
             return float("inf")
         pairs = [*zip(distances, seen, strict=True)]
-        frames = [(row.sum(1) / s.sum(1))[s.any(1)] for d, shown in pairs for row, s in zip(d, shown, strict=True)]
+        frames = [
+            (row.sum(1) / s.sum(1))[s.any(1)]
+            for d, shown in pairs
+            for row, s in zip(d, shown, strict=True)
+        ]
         self.judged.append([1e3 * row.double().cpu().numpy() for row in frames])
         return 1e3 * float(torch.cat([d.sum((1, 2)) / s.sum((1, 2)) for d, s in pairs]).mean())
 
     def amplitudes_mm(self) -> list[float]:
         """Amplitudes of the trials [mm]."""
-        return [1e3 * size for group in self._groups for size in group.replay.trials.amplitude.tolist()]
+        return [
+            1e3 * size for group in self._groups for size in group.replay.trials.amplitude.tolist()
+        ]
 
 
 class JudgedTrainer(EpochTrainer[Corrected]):
@@ -138,7 +162,9 @@ class JudgedTrainer(EpochTrainer[Corrected]):
         epochs: int | None = None,
     ) -> None:
         last = settings.epochs if epochs is None else epochs
-        super().__init__(model, optimiser, judge.error_mm, settings.model_copy(update={"epochs": last}))
+        super().__init__(
+            model, optimiser, judge.error_mm, settings.model_copy(update={"epochs": last})
+        )
         self.train, self.judge = train, judge
 
     def begin(self) -> None:
@@ -158,8 +184,8 @@ class JudgedTrainer(EpochTrainer[Corrected]):
 class InTheLoop(JudgedTrainer[ResidualForce]):
     """Minimises a `MotionLoss` of a force, and a penalty on the squares of its weights, by L-BFGS.
 
-    The force begins at zero, and its last layers have no bias: a constant force would compensate how one trial was
-    held, which does not generalise.
+    The force begins at zero, and its last layers have no bias: a constant force would compensate
+    how one trial was held, which does not generalise.
 
     Args:
         model: to train; its last layers and mean force are set to zero.
@@ -201,7 +227,10 @@ class InTheLoop(JudgedTrainer[ResidualForce]):
         return {"train_loss": float(self._evaluate())}
 
     def _evaluate(self) -> torch.Tensor:
-        """Returns the loss and sets its gradient; cached, as L-BFGS evaluates the weights that it accepts twice."""
+        """Returns the loss and sets its gradient.
+
+        Cached, as L-BFGS evaluates the weights that it accepts twice.
+        """
         if self._last is None or not all(map(torch.equal, self._weights, self._last[0])):
             self.model.zero_grad()
             try:
@@ -211,7 +240,11 @@ class InTheLoop(JudgedTrainer[ResidualForce]):
                 self.model.zero_grad()
                 loss = torch.tensor(_FAILURE, dtype=torch.float64)
             gradients = [torch.zeros_like(w) if w.grad is None else w.grad for w in self._weights]
-            self._last = [w.detach().clone() for w in self._weights], [g.clone() for g in gradients], loss.detach()
+            self._last = (
+                [w.detach().clone() for w in self._weights],
+                [g.clone() for g in gradients],
+                loss.detach(),
+            )
         for weight, gradient in zip(self._weights, self._last[1], strict=True):
             weight.grad = gradient.clone()
         return self._last[2]
@@ -225,25 +258,34 @@ class InTheLoop(JudgedTrainer[ResidualForce]):
 def cross_validated_epochs(
     trainers: Sequence[JudgedTrainer[Any]], advance: Callable[[], None]
 ) -> tuple[int, tuple[list[FloatArray], list[FloatArray]]]:
-    """Returns the number of epochs with the smallest mean error on held-out motions, by cross-validation.
+    """Returns the number of epochs with the smallest mean error
+    on held-out motions, by cross-validation.
 
     Args:
-        trainers: one for each fold, whose `judge` is the loss on the held-out motions, with an error after each epoch.
-            They end after `patience` epochs without an improvement, together.
+        trainers: one for each fold, whose `judge` is the loss on the held-out motions, with an
+            error after each epoch. They end after `patience` epochs without an improvement,
+            together.
         advance: called after every epoch of every fold.
 
     Returns:
-        The number of epochs, 0 where training never improves on its start, and the mean distances (T,) by frame of all
-        held-out motions [mm], at the start and after that number.
+        The number of epochs, 0 where training never improves on its start, and the mean distances
+        (T,) by frame of all held-out motions [mm], at the start and after that number.
     """
     for trainer in trainers:
         trainer.begin()
     while True:
-        means = np.mean([[record["rollout_error_mm"] for record in t.history] for t in trainers], axis=0)
+        means = np.mean(
+            [[record["rollout_error_mm"] for record in t.history] for t in trainers], axis=0
+        )
         best = int(np.argmin(means))
-        if all(trainer.finished for trainer in trainers) or len(means) - 1 - best >= trainers[0].settings.patience:
+        if (
+            all(trainer.finished for trainer in trainers)
+            or len(means) - 1 - best >= trainers[0].settings.patience
+        ):
             judged = [trainer.judge.judged[-len(means) :] for trainer in trainers]
-            before, after = ([row for of_part in judged for row in of_part[epoch]] for epoch in (0, best))
+            before, after = (
+                [row for of_part in judged for row in of_part[epoch]] for epoch in (0, best)
+            )
             return best, (before, after)
         for trainer in trainers:
             trainer.run_epoch()

@@ -1,7 +1,8 @@
 """Networks that predict a residual force, or the next state, from the state.
 
-A model is a multi-layer perceptron between coders (`coders`): these turn (q, v) into standardised inputs, and
-standardised outputs into forces. Their constants come from the training split and are saved with the weights.
+A model is a multi-layer perceptron between coders (`coders`): these turn (q, v) into standardised
+inputs, and standardised outputs into forces. Their constants come from the training split and are
+saved with the weights.
 """
 
 import copy
@@ -26,8 +27,8 @@ ACTIVATIONS = ("normalised_elu", "silu")
 class SkipMLP(nn.Module):
     """Blocks of perceptrons with skip connections between blocks.
 
-    Every linear layer except a block's last is followed by LayerNorm and ELU, as published, or by SiLU alone, which
-    gives a smoother function. Blocks after the first add to their input.
+    Every linear layer except a block's last is followed by LayerNorm and ELU, as published, or by
+    SiLU alone, which gives a smoother function. Blocks after the first add to their input.
 
     Args:
         n_in: inputs.
@@ -38,10 +39,14 @@ class SkipMLP(nn.Module):
         activation: one of `ACTIVATIONS`.
     """
 
-    def __init__(self, n_in: int, n_out: int, blocks: int, layers: int, width: int, activation: str) -> None:
+    def __init__(
+        self, n_in: int, n_out: int, blocks: int, layers: int, width: int, activation: str
+    ) -> None:
         super().__init__()
         sizes = [n_in if i == 0 else n_out for i in range(blocks)]
-        self.blocks = nn.ModuleList(_perceptron(size, n_out, layers, width, activation) for size in sizes)
+        self.blocks = nn.ModuleList(
+            _perceptron(size, n_out, layers, width, activation) for size in sizes
+        )
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Maps (S, n_in) to (S, n_out)."""
@@ -89,7 +94,10 @@ class OwnNetwork(nn.Module):
             shape = tuple(self.core.eval()(torch.zeros(2, n_in)).shape)
         self.core.train()
         if shape != (2, n_out):
-            raise InputError(f"network.core: {core.target} maps (2, {n_in}) to {shape}: it must map to (2, {n_out}).")
+            raise InputError(
+                f"network.core: {core.target} maps (2, {n_in}) to {shape}: "
+                f"it must map to (2, {n_out})."
+            )
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Maps (S, n_in) to (S, n_out)."""
@@ -98,7 +106,8 @@ class OwnNetwork(nn.Module):
 
 
 class StateMap(nn.Module):
-    """Predicts fields from a state, in standardised coordinates: a linear part plus a network for the remainder.
+    """Predicts fields from a state, in standardised coordinates:
+    a linear part plus a network for the remainder.
 
     Attributes:
         fields: names of the predicted fields, in order.
@@ -109,7 +118,8 @@ class StateMap(nn.Module):
         position: coder of displacements from rest.
         velocity: coder of velocities.
         outputs: coder of each predicted field.
-        architecture: number and width of the layers and their activation, or the class of another package.
+        architecture: number and width of the layers and their activation, or the class of another
+            package.
         actuation: coder of further inputs, such as weights or pressures; None without any.
     """
 
@@ -133,7 +143,9 @@ class StateMap(nn.Module):
         self.outputs = nn.ModuleDict(outputs)
         self.acts: Acts = architecture.acts
         keys = (*_ARCHITECTURE, *(("core",) if architecture.core else ()))
-        self.architecture = {key: value for key, value in architecture.plain().items() if key in keys}
+        self.architecture = {
+            key: value for key, value in architecture.plain().items() if key in keys
+        }
         self._sizes = [coder.size for coder in outputs.values()]
         n_in = position.size + velocity.size + (0 if actuation is None else actuation.size)
         n_out = sum(self._sizes)
@@ -169,8 +181,11 @@ class StateMap(nn.Module):
         """Maps standardised inputs (S, n_in) from `encode` to standardised fields (S, n_out)."""
         return inputs @ self.linear + self.remainder * self.network(inputs)
 
-    def encode(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> torch.Tensor:
-        """Standardised inputs (S, n_in), in the network's precision, from q, v (S, N, 3) [m], [m/s] and (S, A) or None.
+    def encode(
+        self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Standardised inputs (S, n_in), in the network's precision, from q,
+        v (S, N, 3) [m], [m/s] and (S, A) or None.
 
         Raises:
             ValueError: no actuation for a model that was built with one.
@@ -183,22 +198,33 @@ class StateMap(nn.Module):
         return torch.cat(parts, dim=1).to(self.linear.dtype)
 
     def missed(self, q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-        """Root mean square distances (S, 2) of displacements [m] and velocities [m/s] from the modes of the inputs."""
+        """Root mean square distances (S, 2) of displacements [m]
+        and velocities [m/s] from the modes of the inputs.
+        """
         pairs = ((self.position, q - self.rest), (self.velocity, v))
-        left = [field - coder.decode(coder.encode(field)) if coder.size else 0.0 * field for coder, field in pairs]
+        left = [
+            field - coder.decode(coder.encode(field)) if coder.size else 0.0 * field
+            for coder, field in pairs
+        ]
         return torch.stack([field.square().sum(2).mean(1).sqrt() for field in left], 1)
 
     def encode_outputs(self, *fields: torch.Tensor) -> torch.Tensor:
-        """Standardised outputs (S, n_out), in the network's precision, from fields (S, N, 3) in the coders' order."""
+        """Standardised outputs (S, n_out), in the network's precision,
+        from fields (S, N, 3) in the coders' order.
+        """
         pairs = zip(self.coders, fields, strict=True)
-        return torch.cat([coder.encode(field) for coder, field in pairs], dim=1).to(self.linear.dtype)
+        return torch.cat([coder.encode(field) for coder, field in pairs], dim=1).to(
+            self.linear.dtype
+        )
 
     def decode(self, inputs: torch.Tensor) -> list[torch.Tensor]:
         """Predicted fields (S, N, 3) in order, from standardised inputs (S, n_in)."""
         parts = self.standardised(inputs).split(self._sizes, dim=1)
         return [coder.decode(part) for coder, part in zip(self.coders, parts, strict=True)]
 
-    def predict(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> list[torch.Tensor]:
+    def predict(
+        self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None
+    ) -> list[torch.Tensor]:
         """Predicted fields (S, N, 3) in order; for the arguments, see `encode`."""
         return self.decode(self.encode(q, v, actuation))
 
@@ -217,7 +243,9 @@ class ResidualForce(StateMap):
 
     fields = ("force",)
 
-    def forward(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> torch.Tensor:
+    def forward(
+        self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None
+    ) -> torch.Tensor:
         """Residual force (S, N, 3) [N]."""
         return self.predict(q, v, actuation)[0]
 
@@ -264,15 +292,17 @@ def build_model(
         v: (S, N, 3) velocities [m/s].
         force: (S, N, 3) residual forces [N]; None for a next state.
         actuation: (S, A) further inputs of the network, or None.
-        stiffness: of the body at rest, for a ``reduced`` network with modes of the static displacements; with modes of
-            the forces themselves if None.
+        stiffness: of the body at rest, for a ``reduced`` network with modes of the static
+            displacements; with modes of the forces themselves if None.
 
     Raises:
         InputError: sizes that do not fit the samples.
     """
     reduced, modes = settings.kind == "reduced", (settings.position_modes, settings.velocity_modes)
     position, velocity = (
-        (pod_coder(field, count) if count else empty_coder(field)) if reduced else nodal_coder(field)
+        (pod_coder(field, count) if count else empty_coder(field))
+        if reduced
+        else nodal_coder(field)
         for field, count in zip((q - rest, v), modes, strict=True)
     )
     if force is None:
@@ -284,10 +314,14 @@ def build_model(
     else:
         coders = [displacement_coder(force, stiffness, settings.force_modes)]
     actuated = None if actuation is None else actuation_coder(actuation)
-    return kind(rest, position, velocity, dict(zip(kind.fields, coders, strict=True)), settings, actuated)
+    return kind(
+        rest, position, velocity, dict(zip(kind.fields, coders, strict=True)), settings, actuated
+    )
 
 
-def restore(kind: type[Model], tensors: Mapping[str, torch.Tensor], description: Mapping[str, Any]) -> Model:
+def restore(
+    kind: type[Model], tensors: Mapping[str, torch.Tensor], description: Mapping[str, Any]
+) -> Model:
     """Returns the model of a ``state_dict`` and a `StateMap.description`."""
 
     def coder(name: str) -> Coder:

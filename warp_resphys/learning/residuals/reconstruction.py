@@ -4,10 +4,10 @@ For each step of an observed trajectory, find the force f that minimises
 
     |C q+(f) - y|^2 + lambda |f|^2
 
-with q+ the simulator's next positions, y the observation, and C the map from positions to markers, linear or not; the
-identity for full states. The next step starts from the reconstructed state, not from the observed one, so that the
-forces reproduce the trajectory in closed loop. With sparse markers, the second term sets the components of f that the
-markers do not determine to zero.
+with q+ the simulator's next positions, y the observation, and C the map from positions to markers,
+linear or not; the identity for full states. The next step starts from the reconstructed state, not
+from the observed one, so that the forces reproduce the trajectory in closed loop. With sparse
+markers, the second term sets the components of f that the markers do not determine to zero.
 """
 
 import copy
@@ -66,7 +66,11 @@ class Reconstructor(ABC):
     """Finds residual forces for a simulator; see `make_reconstructor`."""
 
     def __init__(
-        self, simulator: Simulator, settings: ReconstructionSettings, observation: Observation, acts: Acts
+        self,
+        simulator: Simulator,
+        settings: ReconstructionSettings,
+        observation: Observation,
+        acts: Acts,
     ) -> None:
         self.simulator, self.settings, self.acts = simulator, settings, acts
         self.regularisation = settings.regularisation
@@ -78,13 +82,19 @@ class Reconstructor(ABC):
     def _check_sparse(self, observation: Observation) -> None:
         if not self.regularisation > 0.0:
             raise InputError(
-                f"reconstruction.regularisation is {self.regularisation:g}: it must be positive, as markers do not "
-                "determine the whole force."
+                f"reconstruction.regularisation is {self.regularisation:g}: it must be positive, "
+                "as markers do not determine the whole force."
             )
         last = self.simulator.body.n_vertices - 1
         markers = getattr(observation, "markers", observation)
-        if isinstance(markers, Markers) and not 0 <= int(markers.vertices.min()) <= int(markers.vertices.max()) <= last:
-            raise InputError(f"a marker is on a vertex that the body does not have: its vertices are 0 to {last}.")
+        if (
+            isinstance(markers, Markers)
+            and not 0 <= int(markers.vertices.min()) <= int(markers.vertices.max()) <= last
+        ):
+            raise InputError(
+                "a marker is on a vertex that the body does not have: "
+                f"its vertices are 0 to {last}."
+            )
 
     def with_constants(self, constants: Constants) -> Self:
         """Returns the method with constants in place of the simulator's own."""
@@ -107,8 +117,8 @@ class Reconstructor(ABC):
             state: at the start of the step.
             observed: (B, M, D) measured points, NaN where a point was not seen [unit].
             inputs: during the step; a force in them acts beside the reconstructed one.
-            first_guess: (B, N, 3) initial guess of the force, such as that of the last step [N]; not all methods use
-                it.
+            first_guess: (B, N, 3) initial guess of the force, such as that of the last step [N];
+                not all methods use it.
             read: errors of force sensors after the step.
 
         Raises:
@@ -119,7 +129,8 @@ class Reconstructor(ABC):
 class LeastSquares(Reconstructor):
     """Gauss-Newton or Levenberg-Marquardt; ``tolerance`` is the last change of any position [m].
 
-    Where one formulation does not converge, such as full steps far from the state without the force, the next is used.
+    Where one formulation does not converge, such as full steps far from the state without the
+    force, the next is used.
 
     Args:
         problems: formulations of the same minimum, the fastest first.
@@ -140,21 +151,38 @@ class LeastSquares(Reconstructor):
         read: Read | None = None,
     ) -> ReconstructedStep:
         acting, constants = inputs or Inputs(), self._constants
-        step = (self.simulator, constants, state, acting, observed, self.regularisation, self.observation)
+        step = (
+            self.simulator,
+            constants,
+            state,
+            acting,
+            observed,
+            self.regularisation,
+            self.observation,
+        )
         with threads_for(state.q[0].numel()), torch.no_grad():
             for number, kind in enumerate(self._problems, 1):
                 problem = kind(*step, self.settings.tolerance, read, self.acts)
                 result = minimise(
-                    problem, problem.start(first_guess), self.settings.tolerance, self.settings.max_iterations
+                    problem,
+                    problem.start(first_guess),
+                    self.settings.tolerance,
+                    self.settings.max_iterations,
                 )
                 if result.converged or number == len(self._problems):
                     break
-                log.info("full steps moved by %.1e m after %d: damped ones follow", result.last_step, result.iterations)
-            x, force = (values.to(self.simulator.dtype) for values in problem.solution(result.point))
+                log.info(
+                    "full steps moved by %.1e m after %d: damped ones follow",
+                    result.last_step,
+                    result.iterations,
+                )
+            x, force = (
+                values.to(self.simulator.dtype) for values in problem.solution(result.point)
+            )
             if not result.converged:
                 raise ConvergenceError(
-                    f"{problem.method} reconstruction moved by {result.last_step:.1e} m in its last iteration, the "
-                    f"{result.iterations}th: raise {problem.remedies}.",
+                    f"{problem.method} reconstruction moved by {result.last_step:.1e} m in its "
+                    f"last iteration, the {result.iterations}th: raise {problem.remedies}.",
                     x,
                     None,
                 )
@@ -182,7 +210,9 @@ class LBFGSB(Reconstructor):
         whole = isinstance(self.observation, WholeState)
 
         def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
-            force = torch.as_tensor(values, device=like.device, dtype=like.dtype).reshape(like.shape)
+            force = torch.as_tensor(values, device=like.device, dtype=like.dtype).reshape(
+                like.shape
+            )
             force.requires_grad_(True)
             end = sim.step(state, acting.plus(free * force, self.acts), self._constants)
             residual = self.observation.residual(self.observation(end.q), observed)
@@ -207,10 +237,12 @@ class LBFGSB(Reconstructor):
                 "gtol": 0.0,
             },
         )
-        if result.status == 1:  # An early end of the line search is no failure: the change is down to rounding.
+        if result.status == 1:
+            # An early end of the line search is no failure: the change is down to rounding.
             raise ConvergenceError(
-                f"L-BFGS-B found no minimum in {result.nit} iterations: raise reconstruction.max_iterations, "
-                "reconstruction.tolerance or reconstruction.regularisation.",
+                f"L-BFGS-B found no minimum in {result.nit} iterations: raise "
+                "reconstruction.max_iterations, reconstruction.tolerance or "
+                "reconstruction.regularisation.",
                 like,
                 None,
             )
@@ -227,14 +259,17 @@ def follow(
     inputs: Inputs | None = None,
     read: Callable[[State, State, int], torch.Tensor] | None = None,
 ) -> Iterator[ReconstructedStep]:
-    """Yields the steps that bring bodies to observed points; each starts from the force of the last one.
+    """Yields the steps that bring bodies to observed points.
+
+    Each starts from the force of the last one.
 
     Args:
         method: reconstruction method.
         state: at the start.
         targets: (B, M, D) measured points at the end of each step [unit].
         inputs: of the steps.
-        read: errors of force sensors (B, C) [m] from the states before and after the step of a number.
+        read: errors of force sensors (B, C) [m] from the states before and after the step of a
+            number.
     """
 
     def step(last: ReconstructedStep, now: tuple[int, torch.Tensor]) -> ReconstructedStep:
@@ -268,12 +303,14 @@ def make_reconstructor(
 
     Args:
         simulator: to correct.
-        settings: method and tolerances; ``levenberg_marquardt`` is for markers, which need a positive regularisation.
+        settings: method and tolerances; ``levenberg_marquardt`` is for markers, which need a
+            positive regularisation.
         observation: C, for as many environments as the states have.
         acts: where the force acts; force sensors feel an ``external`` one.
 
     Raises:
-        InputError: a method that does not fit the observation, or a marker on a vertex that the body does not have.
+        InputError: a method that does not fit the observation, or a marker on a vertex that the
+            body does not have.
     """
     problems: dict[str, tuple[type[StepProblem], ...]] = {"gauss_newton": (FullStateProblem,)}
     method = settings.method
@@ -281,7 +318,9 @@ def make_reconstructor(
         damped = (MarkerForceProblem,)
         problems = {"gauss_newton": (MarkerPositionProblem, *damped), "levenberg_marquardt": damped}
     if method not in (*problems, "lbfgsb"):
-        raise InputError(f"reconstruction.method is {method!r}: choose one of {', '.join(problems)}, lbfgsb.")
+        raise InputError(
+            f"reconstruction.method is {method!r}: choose one of {', '.join(problems)}, lbfgsb."
+        )
     arguments = (simulator, settings, observation, acts)
     return LBFGSB(*arguments) if method == "lbfgsb" else LeastSquares(problems[method], *arguments)
 
@@ -292,9 +331,9 @@ class ReconstructedTrials(Brief):
 
     Attributes:
         names: of the trials.
-        read: returns an array of all trials by its name: ``q`` (R, K + 1, N, 3) [m], ``v`` [m/s], ``force`` [N], that
-            of the step that ends in a state, zero in the first one, and ``error`` (R, K + 1), the mean distance of the
-            observed points that were reached [mm].
+        read: returns an array of all trials by its name: ``q`` (R, K + 1, N, 3) [m], ``v`` [m/s],
+            ``force`` [N], that of the step that ends in a state, zero in the first one, and
+            ``error`` (R, K + 1), the mean distance of the observed points that were reached [mm].
     """
 
     names: tuple[str, ...]
@@ -307,7 +346,10 @@ class ReconstructedTrials(Brief):
             InputError: a trial was not reconstructed.
         """
         if missing := [name for name in names if name not in self.names]:
-            raise InputError(f"the trial {missing[0]!r} was not reconstructed: there are {', '.join(self.names)}.")
+            raise InputError(
+                f"the trial {missing[0]!r} was not reconstructed: there are "
+                f"{', '.join(self.names)}."
+            )
         rows = [self.names.index(name) for name in names]
         index = slice(rows[0], rows[-1] + 1) if rows == [*range(rows[0], rows[-1] + 1)] else rows
         return [self.read(name)[index] for name in arrays]
@@ -331,9 +373,10 @@ def reconstruct(
         motions: observed states or markers.
         names: of the trials; all by default.
         parameters: values in place of the simulator's, such as `Identification.parameters`.
-        settings: method, regularisation [unit^2/N^2], tolerance and iterations; the defaults of the class if None.
-        acts: ``internal``, or ``external`` as of water or an obstacle that the simulator lacks: this a force sensor
-            feels. The network must have the same (`NetworkSettings.acts`).
+        settings: method, regularisation [unit^2/N^2], tolerance and iterations; the defaults of the
+            class if None.
+        acts: ``internal``, or ``external`` as of water or an obstacle that the simulator lacks:
+            this a force sensor feels. The network must have the same (`NetworkSettings.acts`).
         parts: workers and files of the work; this process and its memory if None.
 
     Raises:
@@ -344,12 +387,16 @@ def reconstruct(
     used, wanted = without_ringing(simulator, motions.observe), settings or ReconstructionSettings()
     cut_up = list[TrialPart]()
     for number, whole in enumerate(motions.trials.batches(motions.trials.chosen(names))):
-        frames = motions.learned_steps(int(motions.trials.seconds(whole) / used.time_step + 1e-6)) + 1
+        frames = (
+            motions.learned_steps(int(motions.trials.seconds(whole) / used.time_step + 1e-6)) + 1
+        )
         for first, batch in cut(whole, parts.batch):
             work = partial(_reconstructed, used, motions, batch, known, wanted, acts)
             cut_up.append(TrialPart(f"part{number}_{first:03d}", batch, frames, work))
     parts.run(cut_up)
-    return ReconstructedTrials(tuple(name for part in cut_up for name in part.names), partial(parts.joined, cut_up))
+    return ReconstructedTrials(
+        tuple(name for part in cut_up for name in part.names), partial(parts.joined, cut_up)
+    )
 
 
 def _reconstructed(
@@ -363,8 +410,8 @@ def _reconstructed(
 ) -> Arrays:
     """Reconstruction of trials that begin in the same way, see `ReconstructedTrials`.
 
-    Forces from markers are in single precision, which rounds positions to 1e-8 m. A copy of the simulator is used, so
-    that results do not depend on other parts.
+    Forces from markers are in single precision, which rounds positions to 1e-8 m. A copy of the
+    simulator is used, so that results do not depend on other parts.
     """
     simulator = replace(simulator)
     replay = motions.replay(simulator, names, identified)
@@ -381,12 +428,18 @@ def _reconstructed(
     report()
     prepared = replay.prepare(identified.values(replay.simulator))
     sensed = load_reader(replay, start, state, prepared, observed.shape[1])
-    for step in follow(method.with_constants(constants), state, observed[:, 1:].unbind(1), inputs, sensed):
+    for step in follow(
+        method.with_constants(constants), state, observed[:, 1:].unbind(1), inputs, sensed
+    ):
         reached.append(step.state)
         forces.append(step.force)
         report(iterations=step.iterations)
     points = torch.stack([replay.observe(state.q) for state in reached], 1).cpu().numpy()
-    series = {"q": [state.q for state in reached], "v": [state.v for state in reached], "force": forces}
+    series = {
+        "q": [state.q for state in reached],
+        "v": [state.v for state in reached],
+        "force": forces,
+    }
     arrays = {name: torch.stack(values, 1).cpu().numpy() for name, values in series.items()}
     arrays["error"] = mean_distance(points, observed.cpu().numpy())
     dtype = "float64" if motions.sees_states else "float32"

@@ -1,4 +1,6 @@
-"""Supervised training of a model, with weights selected by roll-out error or, as published, by validation loss."""
+"""Supervised training of a model, with weights selected by roll-out error or,
+as published, by validation loss.
+"""
 
 import copy
 import math
@@ -50,14 +52,17 @@ class EpochTrainer(ABC, Generic[Trained]):
     Args:
         model: to train.
         optimiser: of the network's weights; None: the training needs no memory of earlier epochs.
-        rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
+        rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out
+            diverged.
         settings: number of epochs, and how often the roll-out error is measured.
 
     Attributes:
         epoch: epochs done.
-        history: a record for each epoch: ``epoch``, ``train_loss``, ``validation_loss``, ``learning_rate``, and where
-            measured ``rollout_error_mm``, infinite where a roll-out diverged.
-        best_score: smallest value so far of the selection criterion, a roll-out error [mm] or a validation loss.
+        history: a record for each epoch: ``epoch``, ``train_loss``, ``validation_loss``,
+            ``learning_rate``, and where measured ``rollout_error_mm``, infinite where a roll-out
+            diverged.
+        best_score: smallest value so far of the selection criterion, a roll-out error [mm] or a
+            validation loss.
         best_epoch: its epoch.
         best: its weights.
     """
@@ -95,7 +100,9 @@ class EpochTrainer(ABC, Generic[Trained]):
         return record
 
     def _keep(self, record: dict[str, float]) -> None:
-        """Adds a record to the history, and keeps the weights if their score is the first or the best so far."""
+        """Adds a record to the history, and keeps the weights
+        if their score is the first or the best so far.
+        """
         self.history.append(record)
         score = record.get("rollout_error_mm" if self.selection == "rollout" else self.selection)
         if score is not None and (score < self.best_score or not self.best):
@@ -108,11 +115,17 @@ class EpochTrainer(ABC, Generic[Trained]):
 
     @property
     def best_error(self) -> float:
-        """Roll-out error of the kept weights [mm]; infinite if one diverged, NaN before the first measurement."""
+        """Roll-out error of the kept weights [mm].
+
+        Infinite if one diverged, NaN before the first measurement.
+        """
         return self._kept_record().get("rollout_error_mm", math.nan) if self.best else math.nan
 
     def use_best(self) -> Trained:
-        """Returns the model with the kept weights; adds their roll-out error to the history if missing."""
+        """Returns the model with the kept weights.
+
+        Adds their roll-out error to the history if missing.
+        """
         self.model.network.load_state_dict(self.best)
         self.model.eval()
         record = self._kept_record()
@@ -153,7 +166,9 @@ class EpochTrainer(ABC, Generic[Trained]):
         slots: dict[int, dict[str, Any]] = {}
         for name, value in metadata["optimiser"].items():
             index, key = name.split(".")
-            slots.setdefault(int(index), {})[key] = list(value) if isinstance(value, list) else value
+            slots.setdefault(int(index), {})[key] = (
+                list(value) if isinstance(value, list) else value
+            )
         for name, tensor in sorted(with_prefix(tensors, "optimiser.").items()):
             index, key, *position = name.split(".")
             slot = slots.setdefault(int(index), {})
@@ -165,8 +180,9 @@ class EpochTrainer(ABC, Generic[Trained]):
 class Trainer(EpochTrainer[Model]):
     """Minimises the mean squared error of the standardised outputs by Adam.
 
-    The kept weights have the smallest roll-out error on the validation split, measured every few epochs, or the
-    smallest validation loss. In both cases `use_best` records their roll-out error in the history.
+    The kept weights have the smallest roll-out error on the validation split, measured every few
+    epochs, or the smallest validation loss. In both cases `use_best` records their roll-out error
+    in the history.
 
     Args:
         model: to train; on the device of the samples.
@@ -200,7 +216,10 @@ class Trainer(EpochTrainer[Model]):
         self.selection = settings.selection
         self._random = torch.Generator().manual_seed(seed)
         with torch.no_grad():
-            self._train = (model.encode(train.q, train.v, train.actuation), model.encode_outputs(*train.outputs))
+            self._train = (
+                model.encode(train.q, train.v, train.actuation),
+                model.encode_outputs(*train.outputs),
+            )
             self._validation = (
                 model.encode(validation.q, validation.v, validation.actuation),
                 model.encode_outputs(*validation.outputs),
@@ -235,15 +254,23 @@ class Trainer(EpochTrainer[Model]):
         unit = float(self.model.remainder) ** 2
         with torch.no_grad():
             validation = float(self._loss(*self._validation)) * unit
-        return {"train_loss": float(total) / len(inputs) * unit, "validation_loss": validation, "learning_rate": rate}
+        return {
+            "train_loss": float(total) / len(inputs) * unit,
+            "validation_loss": validation,
+            "learning_rate": rate,
+        }
 
     def _noisy(self, inputs: torch.Tensor) -> torch.Tensor:
         if not self.settings.noise > 0.0:
             return inputs
-        return inputs + self.settings.noise * torch.randn(inputs.shape, generator=self._random).to(inputs.device)
+        return inputs + self.settings.noise * torch.randn(inputs.shape, generator=self._random).to(
+            inputs.device
+        )
 
     def _loss(self, inputs: torch.Tensor, outputs: torch.Tensor) -> torch.Tensor:
-        """Mean weighted squared error of the standardised outputs, relative to the remainder of the linear part."""
+        """Mean weighted squared error of the standardised outputs,
+        relative to the remainder of the linear part.
+        """
         error = self.model.standardised(inputs) - outputs
         return (self._weights * error / self.model.remainder).square().mean()
 
@@ -259,10 +286,12 @@ class Trainer(EpochTrainer[Model]):
 
 
 def scale_weights(model: StateMap, exponent: float) -> torch.Tensor:
-    """Weights (n_out,) of the standardised outputs in the loss: powers of their deviations, mean square one in a field.
+    """Weights (n_out,) of the standardised outputs in the loss:
+    powers of their deviations, mean square one in a field.
 
-    With exponent zero, all modes have equal weight. With exponent one, the loss is the squared error of the fields
-    themselves, which a few modes dominate; with a half, small modes are learned too.
+    With exponent zero, all modes have equal weight. With exponent one, the loss is the squared
+    error of the fields themselves, which a few modes dominate; with a half, small modes are learned
+    too.
     """
     weights = []
     for coder in model.coders:
@@ -273,7 +302,11 @@ def scale_weights(model: StateMap, exponent: float) -> torch.Tensor:
 
 def with_prefix(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
     """Returns the tensors whose names start with a prefix, without the prefix."""
-    return {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
+    return {
+        key.removeprefix(prefix): tensor
+        for key, tensor in tensors.items()
+        if key.startswith(prefix)
+    }
 
 
 def run_epochs(
@@ -282,13 +315,16 @@ def run_epochs(
     save: Callable[[Snapshot], None] = lambda kept: None,
     watch: Callable[[Mapping[str, float]], None] | None = None,
 ) -> None:
-    """Trains to the end; saves the last complete epoch regularly, and whenever training ends or is interrupted.
+    """Trains to the end.
+
+    Saves the last complete epoch regularly, and whenever training ends or is interrupted.
 
     Args:
         name: description of the progress bar.
         trainer: trainer, possibly resumed.
         save: saves a snapshot.
-        watch: is called with the record of every epoch; an exception raised by it ends the training.
+        watch: is called with the record of every epoch; an exception raised by it ends the
+            training.
     """
     saved = time.monotonic()
     kept = _copy(trainer.snapshot())

@@ -47,7 +47,13 @@ class AblationMetrics(Usage, total=False):
 
 
 def write_ablation_report(
-    path: Path, metrics: AblationMetrics, settings: RunSettings, *, vertices: int, surface: int, free: int
+    path: Path,
+    metrics: AblationMetrics,
+    settings: RunSettings,
+    *,
+    vertices: int,
+    surface: int,
+    free: int,
 ) -> None:
     """Writes the page, see `write_page`.
 
@@ -63,36 +69,43 @@ def write_ablation_report(
     uncorrected, ablation = metrics["uncorrected_mm"], settings.ablation
     assert ablation is not None
     caption = (
-        f"Mean distance of all {vertices} vertices from the target over the {settings.data.steps} steps of one "
-        "motion, reconstructed from the markers alone. The orange line is the median of "
-        f"{ablation.draws} random sets of markers, the box extends from the lower to the upper "
-        "quartile, the whiskers to the smallest and the largest error."
+        f"Mean distance of all {vertices} vertices from the target over the "
+        f"{settings.data.steps} steps of one motion, reconstructed from the markers alone. The "
+        f"orange line is the median of {ablation.draws} random sets of markers, the box extends "
+        "from the lower to the upper quartile, "
+        "the whiskers to the smallest and the largest error."
     )
     note = (
-        f"The last column is the median distance of the markers themselves. Uncorrected, the simulation is "
-        f"{number_text(uncorrected)}{NO_BREAK_SPACE}mm off on average. The sets are drawn from the {free} surface "
-        "vertices that are not clamped."
+        "The last column is the median distance of the markers themselves. Uncorrected, the "
+        f"simulation is {number_text(uncorrected)}{NO_BREAK_SPACE}mm off on average. The sets "
+        f"are drawn from the {free} surface vertices that are not clamped."
     )
     if more := [str(row.markers) for row in rows if row.markers > free]:
         note += (
-            f" Sets of {', '.join(more)} markers exceed these, and are drawn from all {surface} surface vertices, as "
-            "published."
+            f" Sets of {', '.join(more)} markers exceed these, and are drawn from all {surface} "
+            "surface vertices, as published."
         )
     medians = "; ".join(f"{row.markers}: {number_text(row.median_mm)} mm" for row in rows)
-    alt = f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."
+    alt = (
+        "Box plot of the mean vertex error by number of markers, on a logarithmic axis. "
+        f"Medians: {medians}."
+    )
     assert settings.reconstruction is not None
     how = _how_reconstructed(settings.reconstruction.regularisation)
 
     def sections(canvas: Canvas) -> Iterator[Part]:
         boxes = marker_boxes({row.markers: np.array(row.errors_mm) for row in rows}, uncorrected)
-        yield Part("", [canvas.figure("marker_ablation", boxes, alt, caption), ablation_table(rows, note)])
+        yield Part(
+            "", [canvas.figure("marker_ablation", boxes, alt, caption), ablation_table(rows, note)]
+        )
         yield Part("How it was reconstructed", [Text(how)])
 
     write_page(path, sections, settings, [verdict(rows, uncorrected)], metrics)
 
 
 def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float) -> Figure:
-    """Draws a box for each number of markers: median, quartiles, and whiskers to the smallest and largest draw.
+    """Draws a box for each number of markers: median, quartiles,
+    and whiskers to the smallest and largest draw.
 
     Args:
         errors: (D,) errors [mm] of the draws, by number of markers.
@@ -104,7 +117,9 @@ def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float) -> Figure
     axes, count = figure.subplots(), len(errors)
     lines: Any = {"boxprops": ink, "whiskerprops": ink, "capprops": ink, "medianprops": median}
     axes.boxplot([*errors.values()], widths=0.55, whis=(0, 100), **lines)
-    axes.plot([0.5, count + 0.5], [uncorrected, uncorrected], color=grey, linewidth=1.1, linestyle="--")
+    axes.plot(
+        [0.5, count + 0.5], [uncorrected, uncorrected], color=grey, linewidth=1.1, linestyle="--"
+    )
     place: Any = {"textcoords": "offset points", "ha": "right", "color": grey}
     axes.annotate("uncorrected simulator", (count + 0.5, uncorrected), (-2, 3), **place)
     axes.set_xlim(0.5, count + 0.5)
@@ -119,26 +134,34 @@ def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float) -> Figure
 
 def ablation_table(rows: Sequence[MarkerErrors], note: str = "") -> PageTable:
     """Returns the errors by number of markers."""
-    body = [Row(str(row.markers), [Cell(number_text(getattr(row, key))) for key in _COLUMNS]) for row in rows]
+    body = [
+        Row(str(row.markers), [Cell(number_text(getattr(row, key))) for key in _COLUMNS])
+        for row in rows
+    ]
     return PageTable("Markers", [*_COLUMNS.values()], body, note)
 
 
 def _how_reconstructed(regularisation: float) -> str:
     return Markup(
-        "Step by step from the known first state, with the force of least |markers&nbsp;–&nbsp;observed|<sup>2</sup> + "  # noqa: RUF001
-        "λ&nbsp;|force|<sup>2</sup>, where λ is {}&nbsp;m²/N², free at every vertex. The published study uses "
+        "Step by step from the known first state, with the force of least "
+        "|markers&nbsp;–&nbsp;observed|<sup>2</sup> + "  # noqa: RUF001
+        "λ&nbsp;|force|<sup>2</sup>, where λ is {}&nbsp;m²/N², free at every vertex. "
+        "The published study uses "
         "1.0&nbsp;×&nbsp;10⁻⁴&nbsp;m²/N² for λ."  # noqa: RUF001
     ).format(number_text(regularisation))
 
 
 def verdict(rows: Sequence[MarkerErrors], uncorrected: float) -> str:
-    """Returns the number of markers needed for the published thresholds, and the uncorrected error [mm], in words."""
+    """Returns the number of markers needed for the published thresholds,
+    and the uncorrected error [mm], in words.
+    """
     needed = _markers_below(rows, "median_mm", 0.1)
     text = (
         "With none of these numbers of markers does the median error stay below 0.1 mm."
         if needed is None
-        else f"With {needed} or more markers, the median error stays below 0.1 mm; the published reconstruction needs "
-        f"4. The error of the uncorrected simulator is {number_text(uncorrected)} mm."
+        else f"With {needed} or more markers, the median error stays below 0.1 mm; the published "
+        "reconstruction needs 4. The error of the uncorrected simulator is "
+        f"{number_text(uncorrected)} mm."
     )
     narrow = _markers_below(rows, "interquartile_range_mm", 0.05)
     if narrow is not None:

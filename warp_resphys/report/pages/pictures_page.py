@@ -1,4 +1,6 @@
-"""The page of an identification from pictures: outlines on the pictures, their distances, and the parameters."""
+"""The page of an identification from pictures: outlines on the pictures,
+their distances, and the parameters.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,28 +37,38 @@ _SHOWN: Final = 0.95  # of the points of clouds, whose distances are within the 
 _MARGIN: Final = 25  # px, around the body in a figure
 _COVERED: Final = 0.5  # overlap, below which a fit has failed
 _PANEL: Final = 3.6  # inch
-_BETTER: Final = 0.9  # of the uncorrected distance, below which an identification makes a difference
+_BETTER: Final = (
+    0.9  # of the uncorrected distance, below which an identification makes a difference
+)
 
 
 @dataclass(frozen=True)
 class PictureResult:
-    """Distances of a pose's pictures from those of models, means over pictures by model; None where not measured."""
+    """Distances of a pose's pictures from those of models, means over pictures by model.
+
+    None where not measured.
+    """
 
     pose: str
     material: str  # Its name; empty for one material.
     tested: bool  # Whether it was kept back from the identification.
     pictures: int  # Number of different pictures, of which the middle one is drawn.
-    outline_mm: Mapping[str, float | None]  # Mean distance of the outlines, both ways, at the depth of the body.
+    outline_mm: Mapping[str, float | None]  # Mean distance of the outlines, at the body's depth.
     outline_px: Mapping[str, float | None]
     overlap: Mapping[str, float | None]  # Common area over the area of both.
-    cloud_mm: Mapping[str, float | None]  # Mean distance of the points of scans and depth images from the surface.
+    cloud_mm: Mapping[str, float | None]  # Mean distance of scans and depths from the surface.
     points_mm: Mapping[str, float | None]  # Mean distance of the tracked points.
 
     @property
     def compared(self) -> str:
-        """Kind of distance by which models are compared: outlines, else clouds, else tracked points."""
+        """Kind of distance by which models are compared:
+        outlines, else clouds, else tracked points.
+        """
         kinds = {"outlines": self.outline_mm, "clouds": self.cloud_mm}
-        return next((kind for kind, values in kinds.items() if values["sysid"] is not None), "tracked points")
+        return next(
+            (kind for kind, values in kinds.items() if values["sysid"] is not None),
+            "tracked points",
+        )
 
     @property
     def drawn(self) -> int:
@@ -65,7 +77,9 @@ class PictureResult:
 
     def distance(self, model: str) -> float:
         """Distance by which models are compared [mm]."""
-        value = {"outlines": self.outline_mm, "clouds": self.cloud_mm}.get(self.compared, self.points_mm)[model]
+        value = {"outlines": self.outline_mm, "clouds": self.cloud_mm}.get(
+            self.compared, self.points_mm
+        )[model]
         return float("nan") if value is None else value
 
 
@@ -77,17 +91,23 @@ class PictureMetrics(Usage, total=False):
 
 
 def picture_verdict(results: Sequence[PictureResult]) -> list[str]:
-    """Returns what is best, by how much and on how many poses, and advice; of poses of the training without others."""
+    """Returns what is best, by how much and on how many poses, and advice.
+
+    Of poses of the training without others.
+    """
     shown = [result for result in results if result.tested] or results
     errors = {model: _mean(shown, model) for model in _MODELS}
-    best, second = sorted(("sysid", min(_NAMES, key=lambda model: errors[model])), key=lambda model: errors[model])
+    best, second = sorted(
+        ("sysid", min(_NAMES, key=lambda model: errors[model])), key=lambda model: errors[model]
+    )
     lower = sum(result.distance(best) < result.distance(second) for result in shown)
     names = {"sysid": "the identified simulator", **_NAMES}
-    share, which = (
-        share_text(1.0 - errors[best] / errors[second]),
-        "kept back" if shown[0].tested else "of the training",
+    share = share_text(1.0 - errors[best] / errors[second])
+    which = "kept back" if shown[0].tested else "of the training"
+    text = (
+        f"{names[best]} has {share} less error than {names[second]} "
+        f"({counted(lower, len(shown), 'pose')} {which})"
     )
-    text = f"{names[best]} has {share} less error than {names[second]} ({counted(lower, len(shown), 'pose')} {which})"
     if len(shown) < LEAST_EVIDENCE or 2 * lower <= len(shown):
         both = in_a_row([f"{names[model]} {mm_text(errors[model])}" for model in (best, second)])
         text = f"no evidence either way: {number_of(len(shown), 'pose')} {which} ({both})"
@@ -95,7 +115,9 @@ def picture_verdict(results: Sequence[PictureResult]) -> list[str]:
     if abs(errors["sysid"] - errors["simulation"]) < (1.0 - _BETTER) * errors["simulation"]:
         doubts.append("these poses hardly depend on the material, and do not test it")
     if lost := [
-        result.pose for result in results if (common := result.overlap["sysid"]) is not None and common < _COVERED
+        result.pose
+        for result in results
+        if (common := result.overlap["sysid"]) is not None and common < _COVERED
     ]:
         doubts.append(f"{listed(lost)} hardly overlap: check the camera, the mesh and the mask")
     advice = [f"Check before use: {'; '.join(doubts)}."] if doubts else []
@@ -133,37 +155,49 @@ def write_pictures_report(
     results, settings = [PictureResult(**row) for row in metrics["poses"]], run.pictures
     assert settings is not None
     played, as_played = settings.simulated, {**dict.fromkeys(TILTS, 0.0), **NEUTRAL}
-    truth = {} if played is None else {**as_played, **start, **played.material, **played.corrections}
+    truth = (
+        {} if played is None else {**as_played, **start, **played.material, **played.corrections}
+    )
     columns = ["Data sheet", "Identified", *(["True"] if truth else []), "At a bound"]
     panels = [
-        (result, picture(result.pose, result.drawn)) for result in results if result.outline_mm["sysid"] is not None
+        (result, picture(result.pose, result.drawn))
+        for result in results
+        if result.outline_mm["sysid"] is not None
     ]
     clouds = [result for result in results if result.cloud_mm["sysid"] is not None]
     # Pictures without outlines are shown as well, where there is nothing else to see.
-    panels = panels or [(result, picture(result.pose, result.drawn)) for result in results if not clouds]
+    panels = panels or [
+        (result, picture(result.pose, result.drawn)) for result in results if not clouds
+    ]
     up = [-np.array(settings.poses[result.pose].gravity or run.gravity) for result in clouds]
 
     def sections(canvas: Canvas) -> Iterator[Part]:
-        drawn: list[Block] = [draw_outlines(panels, outlines, canvas.folder / "outlines.png")] if panels else []
+        drawn: list[Block] = (
+            [draw_outlines(panels, outlines, canvas.folder / "outlines.png")] if panels else []
+        )
         seen = list(zip(clouds, up, strict=True))
         drawn += [draw_clouds(seen, outlines, canvas.folder / "clouds.png")] if seen else []
         yield Part("", [*drawn, distance_table(results)])
-        yield Part("Identification", [PageTable("Parameter", columns, parameter_rows(identified, start, truth), _NOTE)])
+        yield Part(
+            "Identification",
+            [PageTable("Parameter", columns, parameter_rows(identified, start, truth), _NOTE)],
+        )
         yield Part("How it is compared", [Text(_HOW)])
 
     write_page(path, sections, run, picture_verdict(results), metrics)
 
 
 _NOTE: Final = (
-    "± is one standard deviation in the Gauss-Newton approximation, for distances that are correlated along the "
-    "outlines."
+    "± is one standard deviation in the Gauss-Newton approximation, for distances that are "
+    "correlated along the outlines."
 )
 _HOW: Final = (
-    "A distance is the mean over both outlines of that to the closest point of the other, at the mean depth of the "
-    "body; parts that a clamp hides do not count. The overlap is the common area over that of both together. The "
-    "distance of a cloud is the mean over its points of that to the surface, of a depth image to its visible side; a "
-    "point beyond the reach counts as one at it. What belongs to a pose alone, such as its place before the camera, is "
-    "fitted to it for each of the models."
+    "A distance is the mean over both outlines of that to the closest point of the other, at the "
+    "mean depth of the body; parts that a clamp hides do not count. The overlap is the common "
+    "area over that of both together. The distance of a cloud is the mean over its points of "
+    "that to the surface, of a depth image to its visible side; a point beyond the reach counts "
+    "as one at it. What belongs to a pose alone, such as its place before the camera, is fitted "
+    "to it for each of the models."
 )
 
 
@@ -173,7 +207,10 @@ def distance_table(results: Sequence[PictureResult]) -> PageTable:
     others = {
         name: key
         for name, key in others.items()
-        if any(getattr(result, key)["sysid"] not in (None, result.distance("sysid")) for result in results)
+        if any(
+            getattr(result, key)["sysid"] not in (None, result.distance("sysid"))
+            for result in results
+        )
     }
     rows = []
     for result in results:
@@ -182,7 +219,9 @@ def distance_table(results: Sequence[PictureResult]) -> PageTable:
         rows.append(Row(result.pose, cells, "kept back" * result.tested, result.material))
     kinds = dict.fromkeys(result.compared for result in results)
     return PageTable(
-        f"Pose; distance of {' or '.join(kinds)}", [*(f"{name} [mm]" for name in _MODELS.values()), *others], rows
+        f"Pose; distance of {' or '.join(kinds)}",
+        [*(f"{name} [mm]" for name in _MODELS.values()), *others],
+        rows,
     )
 
 
@@ -190,7 +229,9 @@ def _text(value: float | None) -> str:
     return NONE if value is None else number_text(value)
 
 
-def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], outlines: Path, path: Path) -> Drawn:
+def draw_outlines(
+    panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], outlines: Path, path: Path
+) -> Drawn:
     """Draws the outlines in a file on the middle picture (H, W, 3) of every pose, into a PNG file.
 
     Raises:
@@ -210,24 +251,41 @@ def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], out
             if group not in file:
                 continue
             measured = read_array(file, f"{group}/measured")
-            axis.plot(*measured.T, linestyle="", marker=".", markersize=1.0, color="#ffffff", label="measured")
+            axis.plot(
+                *measured.T,
+                linestyle="",
+                marker=".",
+                markersize=1.0,
+                color="#ffffff",
+                label="measured",
+            )
             for model, colour in _DRAWN.items():
-                points, weight = (read_array(file, f"{group}/{model}{end}") for end in ("", "_weight"))
+                points, weight = (
+                    read_array(file, f"{group}/{model}{end}") for end in ("", "_weight")
+                )
                 points = points[weight > 0.0]
                 axis.plot(
-                    *points.T, linestyle="", marker=".", markersize=0.9, color=colour, label=_MODELS[model].lower()
+                    *points.T,
+                    linestyle="",
+                    marker=".",
+                    markersize=0.9,
+                    color=colour,
+                    label=_MODELS[model].lower(),
                 )
             low, high = _frame_of(measured, _MARGIN)
             axis.set_xlim(low[0], high[0])
             axis.set_ylim(high[1], low[1])
     handles, labels = axes[0].get_legend_handles_labels()
     if handles:
-        legend = figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=True, markerscale=6)
+        legend = figure.legend(
+            handles, labels, loc="outside lower center", ncols=3, frameon=True, markerscale=6
+        )
         legend.get_frame().set_facecolor("#8a929b")
     figure.savefig(path, dpi=170)
     caption = (
-        "The middle picture of each pose: the measured outline (white), and those of the uncorrected simulator, which "
-        "has the parameters of the data sheet (orange), and of the identified one (blue), without what a clamp hides."
+        "The middle picture of each pose: the measured outline (white), and those of the "
+        "uncorrected simulator, which has the parameters of the data sheet (orange), and of the "
+        "identified one (blue), without what a clamp hides."
     )
     alt = "; ".join(
         f"{result.pose}: {_text(result.outline_mm['simulation'])} mm uncorrected, "
@@ -237,8 +295,11 @@ def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], out
     return Drawn.of(path, f"Outlines on pictures. Mean distances: {alt}.", caption)
 
 
-def draw_clouds(panels: Sequence[tuple[PictureResult, FloatArray]], outlines: Path, path: Path) -> Drawn:
-    """Draws the first cloud of every pose on the body of each model into a PNG file, in colours of the distance.
+def draw_clouds(
+    panels: Sequence[tuple[PictureResult, FloatArray]], outlines: Path, path: Path
+) -> Drawn:
+    """Draws the first cloud of every pose on the body of each model into a PNG file,
+    in colours of the distance.
 
     Poses have the direction (3,) upwards.
 
@@ -248,18 +309,33 @@ def draw_clouds(panels: Sequence[tuple[PictureResult, FloatArray]], outlines: Pa
     clouds = list[tuple[PictureResult, list[tuple[FloatArray, ...]]]]()
     with read_hdf5(outlines, "outlines") as file:
         for result, up in panels:
-            number = next(frame for frame in file[result.pose] if f"{_FIRST}_places" in file[f"{result.pose}/{frame}"])
+            number = next(
+                frame
+                for frame in file[result.pose]
+                if f"{_FIRST}_places" in file[f"{result.pose}/{frame}"]
+            )
             clouds.append((result, _seen_from_the_side(file[f"{result.pose}/{number}"], up)))
-    most = max(float(np.quantile(distances, _SHOWN)) for _, seen in clouds for _, distances, _ in seen[1:])
-    figure = Figure(figsize=(len(_MODELS) * _CLOUD_PANEL, len(clouds) * _CLOUD_PANEL * 0.8), layout="constrained")
+    most = max(
+        float(np.quantile(distances, _SHOWN)) for _, seen in clouds for _, distances, _ in seen[1:]
+    )
+    figure = Figure(
+        figsize=(len(_MODELS) * _CLOUD_PANEL, len(clouds) * _CLOUD_PANEL * 0.8),
+        layout="constrained",
+    )
     axes = figure.subplots(len(clouds), len(_MODELS), squeeze=False)
     dots = None
     for (result, seen), row in zip(clouds, axes, strict=True):
-        ends = np.concatenate([part.reshape(-1, 2) for places, _, body in seen for part in (places, body)])
+        ends = np.concatenate(
+            [part.reshape(-1, 2) for places, _, body in seen for part in (places, body)]
+        )
         low, high = _frame_of(ends, _CLOUD_MARGIN * float(np.ptp(ends, axis=0).max()))
         for model, axis, (places, distances, body) in zip(_MODELS, row, seen, strict=True):
-            axis.add_collection(PolyCollection([*body], facecolors=_BODY, edgecolors=_BODY, linewidths=0.3))
-            dots = axis.scatter(*places.T, c=distances, s=2.5, cmap="viridis", vmin=0.0, vmax=most, linewidths=0)
+            axis.add_collection(
+                PolyCollection([*body], facecolors=_BODY, edgecolors=_BODY, linewidths=0.3)
+            )
+            dots = axis.scatter(
+                *places.T, c=distances, s=2.5, cmap="viridis", vmin=0.0, vmax=most, linewidths=0
+            )
             axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
             axis.set_axis_off()
             axis.set_title(
@@ -271,17 +347,22 @@ def draw_clouds(panels: Sequence[tuple[PictureResult, FloatArray]], outlines: Pa
         bar.set_label("distance of a point from the surface [mm]")
     figure.savefig(path, dpi=170)
     caption = (
-        "Measured points on the simulated body (grey) as seen from the side, above with the mean of their distances: "
-        "the undeformed body, the simulator with the parameters of the data sheet, and the identified one."
+        "Measured points on the simulated body (grey) as seen from the side, above with the mean "
+        "of their distances: the undeformed body, the simulator with the parameters of the data "
+        "sheet, and the identified one."
     )
     alt = "; ".join(
-        f"{result.pose}: {', '.join(_text(result.cloud_mm[model]) for model in _MODELS)} mm" for result, _ in panels
+        f"{result.pose}: {', '.join(_text(result.cloud_mm[model]) for model in _MODELS)} mm"
+        for result, _ in panels
     )
-    return Drawn.of(path, f"Clouds of points on bodies. Mean distances of the three models: {alt}.", caption)
+    return Drawn.of(
+        path, f"Clouds of points on bodies. Mean distances of the three models: {alt}.", caption
+    )
 
 
 def _seen_from_the_side(group: h5py.Group, up: FloatArray) -> list[tuple[FloatArray, ...]]:
-    """The points (P, 2) of a cloud, their distances (P,) [mm] and the triangles (F, 3, 2) of the body, by model.
+    """The points (P, 2) of a cloud, their distances (P,) [mm]
+    and the triangles (F, 3, 2) of the body, by model.
 
     They are seen along the horizontal direction in which the body is thinnest.
     """
@@ -291,7 +372,9 @@ def _seen_from_the_side(group: h5py.Group, up: FloatArray) -> list[tuple[FloatAr
     axes = np.stack([np.linalg.eigh(level @ np.cov(shape.T) @ level)[1][:, -1], up], 1)
     seen = list[tuple[FloatArray, ...]]()
     for model in _MODELS:
-        places, distances, surface = (read_array(group, f"{model}_{key}") for key in ("places", "distances", "surface"))
+        places, distances, surface = (
+            read_array(group, f"{model}_{key}") for key in ("places", "distances", "surface")
+        )
         seen.append((places @ axes, 1e3 * distances, surface[triangles] @ axes))
     return seen
 

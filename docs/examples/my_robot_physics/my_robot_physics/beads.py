@@ -1,4 +1,6 @@
-"""Beads in transparent silicone as markers: each moves with the point of the cell that it is cast into."""
+"""Beads in transparent silicone as markers: each moves
+with the point of the cell that it is cast into.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +24,9 @@ class Beads(Markers):
     gradients: torch.Tensor  # (m, K, 3) derivatives of the weights by the place of the bead [1/m]
 
     @classmethod
-    def bind(cls, mesh: Mesh, places: np.ndarray, labels: Sequence[str], largest_outside: Positive = 5e-4) -> "Beads":
+    def bind(
+        cls, mesh: Mesh, places: np.ndarray, labels: Sequence[str], largest_outside: Positive = 5e-4
+    ) -> "Beads":
         """Returns beads at places (m, 3) on the undeformed body [m].
 
         Args:
@@ -37,14 +41,21 @@ class Beads(Markers):
         found = locate(mesh, places)
         far = int(np.argmax(found.outside))
         if found.outside[far] > largest_outside:
-            raise InputError(f"{labels[far]} is {1e3 * found.distance[far]:.2g} mm outside of the body: move the bead.")
-        return cls(*map(torch.from_numpy, (mesh.cells[found.cells], found.weights, found.gradients)))
+            raise InputError(
+                f"{labels[far]} is {1e3 * found.distance[far]:.2g} mm outside "
+                "of the body: move the bead."
+            )
+        return cls(
+            *map(torch.from_numpy, (mesh.cells[found.cells], found.weights, found.gradients))
+        )
 
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         """Returns the beads (B, m, 3) for positions (B, N, 3) of the vertices [m]."""
         return torch.einsum("bmki,mk->bmi", positions[:, self.vertices], self.weights)
 
     def moved(self, by: torch.Tensor) -> "Beads":
-        """Returns beads that were cast elsewhere by (m, 3) [m], since nobody knows their places exactly."""
+        """Returns beads that were cast elsewhere by (m, 3) [m],
+        since nobody knows their places exactly.
+        """
         weights = self.weights + torch.einsum("mkj,mj->mk", self.gradients, by.to(self.weights))
         return replace(self, weights=weights)

@@ -1,9 +1,12 @@
-"""A magnetised body in a uniform field, as an actuator: Zhao et al., J. Mech. Phys. Solids 124 (2019).
+"""A magnetised body in a uniform field, as an actuator: Zhao et al., J. Mech. Phys.
+
+Solids 124 (2019).
 
     e = -B b . F M d  [J/m^3]
 
-with the magnetisation M [A/m] along d at rest, and the field B [T], the input, along b in the world.
-tests/test_magnet.py compares the deflection of a beam with beam theory, and gradients with differences.
+with the magnetisation M [A/m] along d at rest, and the field B [T], the input, along b in the
+world. tests/test_magnet.py compares the deflection of a beam with beam theory, and gradients with
+differences.
 """
 
 from dataclasses import MISSING, dataclass, replace
@@ -18,9 +21,17 @@ from warp_resphys.mesh.selection import select_cells
 from warp_resphys.settings.mesh import BoxSettings, Direction
 from warp_resphys.stepping.quantity import Quantity, parameter
 
+# The name is that of the input in Python, and in identified parameters such as
+# magnetic_field_factor.
 FIELD = Quantity(
-    "magnetic_field", "T", per="coil", typical=0.02, words="field", shown_unit="mT", shown_factor=1e3
-)  # the name is that of the input in Python, and in identified parameters such as magnetic_field_factor
+    "magnetic_field",
+    "T",
+    per="coil",
+    typical=0.02,
+    words="field",
+    shown_unit="mT",
+    shown_factor=1e3,
+)
 vec5 = wp.types.vector(5, wp.float64)
 
 
@@ -39,7 +50,9 @@ class Magnet(PointwiseEnergy):
     magnetisation: Positive = parameter(MISSING, "magnetisation", "A/m", closed=True)  # M
     along: Direction = (1.0, 0.0, 0.0)  # d, at rest; it is scaled to length one
     # b, in the world; it is scaled to length one
-    field_direction: Direction = parameter((0.0, 0.0, 1.0), "field_direction", "", -np.inf, shape=(3,))
+    field_direction: Direction = parameter(
+        (0.0, 0.0, 1.0), "field_direction", "", -np.inf, shape=(3,)
+    )
     within: BoxSettings | None = None  # the cells that are magnetised; None: all
 
     def __post_init__(self):

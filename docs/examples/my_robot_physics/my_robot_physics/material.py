@@ -1,11 +1,13 @@
-r"""The rubber of eight chains by Arruda and Boyce (J. Mech. Phys. Solids 41, 1993), by its series of five terms.
+r"""The rubber of eight chains by Arruda and Boyce (J. Mech. Phys. Solids 41, 1993),
+by its series of five terms.
 
     W = mu' sum_i c_i (I^i - 3^i) / L^(2 (i - 1)),  c = 1/2, 1/20, 11/1050, 19/7000, 519/673750
 
-I is the first invariant and L the stretch at which the chains lock. So that the rest shape is free of stress and
-inverted cells have finite energies, I = ||F||^2 - 2 (J - 1) + (J - 1)^2, which is the first invariant where the volume
-is constant. mu' follows from the shear modulus mu at rest. tests/test_material.py compares it with the closed form in
-uniaxial tension, and its gradients with differences.
+I is the first invariant and L the stretch at which the chains lock. So that the rest shape is free
+of stress and inverted cells have finite energies, I = ||F||^2 - 2 (J - 1) + (J - 1)^2, which is the
+first invariant where the volume is constant. mu' follows from the shear modulus mu at rest.
+tests/test_material.py compares it with the closed form in uniaxial tension, and its gradients with
+differences.
 """
 
 from dataclasses import dataclass
@@ -16,8 +18,11 @@ from warp_resphys.energies.materials import DensityMaterial
 from warp_resphys.stepping.quantity import Parameter, parameter
 
 # Written in a function, quotients would be computed in single precision.
-C1, C2, C3, C4, C5 = (wp.constant(wp.float64(c)) for c in (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750))
-M1, M2, M3, M4 = (wp.constant(wp.float64(m)) for m in (3 / 5, 99 / 175, 513 / 875, 42039 / 67375))  # of mu / mu'
+C1, C2, C3, C4, C5 = (
+    wp.constant(wp.float64(c)) for c in (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
+)
+# Of mu / mu'.
+M1, M2, M3, M4 = (wp.constant(wp.float64(m)) for m in (3 / 5, 99 / 175, 513 / 875, 42039 / 67375))
 TWO_THIRDS = wp.constant(wp.float64(2 / 3))
 ONE, TWO, THREE, HALF = (wp.constant(wp.float64(n)) for n in (1.0, 2.0, 3.0, 0.5))
 

@@ -16,9 +16,15 @@ class Sines(nn.Module):
         frequency: factor of the inputs of the sines.
     """
 
-    def __init__(self, inputs: int, outputs: int, width: Natural = 16, frequency: Positive = 1.0) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, width: Natural = 16, frequency: Positive = 1.0
+    ) -> None:
         super().__init__()
-        self.first, self.last, self.frequency = nn.Linear(inputs, width), nn.Linear(width, outputs), frequency
+        self.first, self.last, self.frequency = (
+            nn.Linear(inputs, width),
+            nn.Linear(width, outputs),
+            frequency,
+        )
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Maps standardised inputs to standardised outputs."""

@@ -35,5 +35,7 @@ def test_a_bead_outside_is_refused():
 
 def test_gradients_of_the_network_equal_differences():
     network = Sines(3, 2, width=5, frequency=2.0).double()
-    x = torch.randn(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    x = torch.randn(
+        4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True
+    )
     assert torch.autograd.gradcheck(network, (x,))

@@ -5,7 +5,14 @@ import pytest
 import torch
 from my_robot_physics.material import ArrudaBoyce
 
-from warp_resphys import Body, Simulator, SolverSettings, StableNeoHookean, box_hexahedra, select_vertices
+from warp_resphys import (
+    Body,
+    Simulator,
+    SolverSettings,
+    StableNeoHookean,
+    box_hexahedra,
+    select_vertices,
+)
 from warp_resphys.studies.gradient_check import check_gradients
 
 TIGHT = SolverSettings(name="newton", relative_tolerance=1e-10)
@@ -28,7 +35,11 @@ def slope(first, locking):
 @pytest.mark.parametrize("stretch", [0.7, 1.5, 2.2])
 def test_uniaxial_tension_is_that_of_the_closed_form(stretch):
     """At constant volume the nominal stress is 2 (l - l^-2) dW/dI."""
-    s = Simulator(Body(CUBE, fixed=select_vertices(CUBE, x=0.0)), ArrudaBoyce(MU, LOCKING, BULK), gravity=(0, 0, 0))
+    s = Simulator(
+        Body(CUBE, fixed=select_vertices(CUBE, x=0.0)),
+        ArrudaBoyce(MU, LOCKING, BULK),
+        gravity=(0, 0, 0),
+    )
     here, across = s.linearise(s.rest_state(), parameters={"density": 1e-9}), stretch**-0.5
     for _ in range(20):  # The sides follow from the small change of volume.
         x = s.rest_positions * torch.tensor([stretch, across, across], dtype=torch.float64)
@@ -56,4 +67,6 @@ def test_gradients_by_its_parameters_equal_differences():
     s = Simulator(Body(BEAM, fixed=select_vertices(BEAM, x=0.0)), rubber, solver=tight)
     rows = check_gradients(s, "bent", steps=2)
     assert {"shear_modulus", "locking_stretch", "bulk_modulus"} <= {row.parameter for row in rows}
-    assert {row.parameter: row.relative_error for row in rows if not row.relative_error <= 1e-6} == {}
+    assert {
+        row.parameter: row.relative_error for row in rows if not row.relative_error <= 1e-6
+    } == {}

@@ -34,14 +34,14 @@ import torch
 from benchmarks import gripper, mounted, peers, reactions, steps, twin_rate
 
 from warp_resphys.commands import USER_ERROR
-from warp_resphys.dynamics.nonlinear_solver import SOLVERS
+from warp_resphys.core.dynamics.nonlinear_solver import SOLVERS
+from warp_resphys.core.linalg.choice import LINEAR_SOLVERS
 from warp_resphys.experiment.build import choose_device
 from warp_resphys.io.errors import ResphysError
 from warp_resphys.io.machine import commit, hardware
 from warp_resphys.io.progress import show
 from warp_resphys.io.resuming import package_versions
 from warp_resphys.io.safe_files import read_json, write_json
-from warp_resphys.linalg.choice import LINEAR_SOLVERS
 from warp_resphys.report.page import PageTable
 
 

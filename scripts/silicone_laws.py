@@ -18,9 +18,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from warp_resphys.core.energies.catalogue import read_law
+from warp_resphys.core.energies.isochoric import shear_modulus, stress
 from warp_resphys.data.material_tables import read_test
-from warp_resphys.energies.catalogue import read_law
-from warp_resphys.energies.isochoric import shear_modulus, stress
 from warp_resphys.io.resuming import package_versions
 from warp_resphys.learning.identification.material_tests import (
     BEYOND,

@@ -7,6 +7,8 @@ import ast
 import functools
 import importlib
 import re
+import subprocess
+import sys
 from collections import Counter
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -34,8 +36,14 @@ def rows():
 
 
 def place_of(name):
-    """Where a module inside the package belongs: "io.text" to `io/`, "cli" to `cli`."""
-    first = name.split(".")[0]
+    """Where a module inside the package belongs: "io.text" to `io/`, "cli" to `cli`.
+
+    The folders of the core have a place each: "core.fem.bodies" belongs to `core/fem/`.
+    """
+    first, _, rest = name.partition(".")
+    folder = rest.partition(".")[0]
+    if first == "core" and (PACKAGE / first / folder).is_dir() and folder:
+        return f"{first}/{folder}/"
     is_folder = (PACKAGE / first).is_dir() or first in ("kernels", "conf", "scripts")
     return f"{first}/" if is_folder else first
 
@@ -108,6 +116,19 @@ def test_imports_point_up():
         if lower:
             down[name] = lower
     assert down == {}
+
+
+def test_the_core_stands_alone():
+    """Some of its tests, with all that stands on it hidden."""
+    arguments = ["-p", "support.core_alone", "--confcutdir=tests/core", "-p", "no:cacheprovider"]
+    tests = [
+        "tests/core/fem",
+        "tests/core/dynamics/test_tape.py",
+        "tests/core/energies/test_medium.py",
+    ]
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", *arguments, *tests]
+    ended = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stdout[-3000:]
 
 
 def test_no_two_modules_import_each_other():

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import warp_resphys as wr
-from warp_resphys.dynamics.statics import find_equilibrium
+from warp_resphys.core.dynamics.statics import find_equilibrium
 
 BOX = wr.box_hexahedra((0.04, 0.01, 0.01), (4, 1, 1))
 FREE, CLAMPED = wr.Body(BOX), wr.Body(BOX, fixed=wr.select_vertices(BOX, x=0.0))

@@ -9,10 +9,11 @@ from jsonschema import Draft202012Validator, ValidationError
 from omegaconf import OmegaConf
 
 from support.configured import settings
+from warp_resphys.core.fem.bodies import MASS_MODES
+from warp_resphys.core.fem.integration_points import VOLUME_INTEGRATIONS
+from warp_resphys.core.stepping.integrators import INTEGRATORS
 from warp_resphys.data.markers import KINDS
 from warp_resphys.experiment.experiment import MODELS
-from warp_resphys.fem.bodies import MASS_MODES
-from warp_resphys.fem.integration_points import VOLUME_INTEGRATIONS
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.residuals.networks import ACTIVATIONS
 from warp_resphys.settings.body import PhysicsSettings, SimulatorSettings
@@ -21,7 +22,6 @@ from warp_resphys.settings.editor_schema import editor_schema
 from warp_resphys.settings.learning import NetworkSettings
 from warp_resphys.settings.observed import MarkerSettings
 from warp_resphys.settings.stage_keys import StageSettings
-from warp_resphys.stepping.integrators import INTEGRATORS
 
 ROOT = Path(__file__).parents[1]
 

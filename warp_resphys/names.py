@@ -1,34 +1,11 @@
-"""The public names of the package, which `warp_resphys` imports when one of them is first used."""
+"""The public names of the package; those of the simulator alone are imported without the others."""
 
+from .core.public import *  # noqa: F403
 from .data.force_sensors import ForceSensor as ForceSensor
 from .data.markers import Markers as Markers
 from .data.markers import Observation as Observation
 from .data.markers import bind_markers as bind_markers
 from .data.recordings.recording_files import read_recording as read_recording
-from .dynamics.simulator import Simulator as Simulator
-from .dynamics.tape import record_rollout as record_rollout
-from .dynamics.trajectory import Motion as Motion
-from .energies.catalogue import read_material as read_material
-from .energies.catalogue import silicone as silicone
-from .energies.contact.obstacle_contact import Contact as Contact
-from .energies.contact.surface_contact import SurfaceContact as SurfaceContact
-from .energies.fibres import Fibres as Fibres
-from .energies.materials import Corotated as Corotated
-from .energies.materials import StableNeoHookean as StableNeoHookean
-from .energies.muscles import Muscles as Muscles
-from .energies.pressure import Pressure as Pressure
-from .energies.tendons import Tendons as Tendons
-from .fem.bodies import Body as Body
-from .fem.bodies import Glue as Glue
-from .fem.bodies import PointMass as PointMass
-from .fem.coordinates import SymmetryPlane as SymmetryPlane
-from .fem.scene import Scene as Scene
-from .io.errors import ConvergenceError as ConvergenceError
-from .io.errors import DataFileError as DataFileError
-from .io.errors import InputError as InputError
-from .io.errors import MeshError as MeshError
-from .io.errors import ResphysError as ResphysError
-from .io.errors import ResphysWarning as ResphysWarning
 from .learning.evaluation import evaluate as evaluate
 from .learning.identification.identification import identify as identify
 from .learning.identification.law_search import identify_law as identify_law
@@ -36,23 +13,10 @@ from .learning.observed_motions import ObservedMotions as ObservedMotions
 from .learning.residuals.actuator_fit import fit_actuator as fit_actuator
 from .learning.residuals.fitting import fit_force as fit_force
 from .learning.residuals.reconstruction import reconstruct as reconstruct
-from .mesh.boxes import box_hexahedra as box_hexahedra
-from .mesh.boxes import box_tetrahedra as box_tetrahedra
-from .mesh.readers import read_mesh as read_mesh
-from .mesh.rod import rod as rod
-from .mesh.selection import select_vertices as select_vertices
-from .mesh.volume_mesh import Mesh as Mesh
-from .mesh.volume_mesh import quadratic as quadratic
 from .report.motion_film import film as film
 from .robot.loading import load as load
 from .robot.loading import recorded_trial as recorded_trial
 from .robot.loading import trial_names as trial_names
 from .robot.robot import Robot as Robot
 from .robot.robot_scene import RobotScene as RobotScene
-from .settings.body import Rigid as Rigid
-from .settings.body import SolverSettings as SolverSettings
-from .settings.contact import Cylinder as Cylinder
-from .settings.contact import HalfSpace as HalfSpace
-from .stepping.inputs import Inputs as Inputs
-from .stepping.state import State as State
 from .twin.twin import Twin as Twin

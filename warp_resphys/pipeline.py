@@ -20,7 +20,7 @@ import torch
 from .control.control_files import BASELINES, plan_table, plans_file, reduced_file
 from .control.control_stages import drive, fit_baselines, plan_motions, reduce_robot
 from .control.task import motions_of
-from .energies.catalogue import law_path
+from .core.energies.catalogue import law_path
 from .experiment import files
 from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device

@@ -42,8 +42,8 @@ import torch
 import warp as wp
 
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
-from warp_resphys.energies.pointwise import PointwiseEnergy, at_vertices, between
-from warp_resphys.stepping.quantity import parameter
+from warp_resphys.core.energies.pointwise import PointwiseEnergy, at_vertices, between
+from warp_resphys.core.stepping.quantity import parameter
 
 wp.config.log_level = wp.LOG_WARNING
 

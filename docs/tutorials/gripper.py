@@ -38,7 +38,7 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
-from warp_resphys.mesh.volume_mesh import boundary_faces
+from warp_resphys.core.mesh.volume_mesh import boundary_faces
 
 wp.config.log_level = wp.LOG_WARNING
 

@@ -35,12 +35,12 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
+from warp_resphys.core.stepping.rollout import rollout
 from warp_resphys.data.markers import MarkerMap
 from warp_resphys.learning.residuals.correction import CorrectedSimulator, known_positions
 from warp_resphys.learning.residuals.networks import ResidualForce, build_model
 from warp_resphys.learning.residuals.reconstruction import make_reconstructor
 from warp_resphys.settings.learning import NetworkSettings, ReconstructionSettings
-from warp_resphys.stepping.rollout import rollout
 
 wp.config.log_level = wp.LOG_WARNING
 torch.manual_seed(0)

@@ -11,22 +11,22 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from warp_resphys.dynamics.simulator import Simulator
-from warp_resphys.energies.contact.obstacle_contact import Contact
-from warp_resphys.energies.contact.pairs import PairList, Surface
-from warp_resphys.energies.contact.surface_contact import SurfaceContact
-from warp_resphys.energies.launcher import Launcher
-from warp_resphys.energies.materials import Corotated
-from warp_resphys.energies.tendons import Tendons
+from warp_resphys.core.dynamics.simulator import Simulator
+from warp_resphys.core.dynamics.solver_settings import SolverSettings
+from warp_resphys.core.energies.contact.obstacle_contact import Contact
+from warp_resphys.core.energies.contact.pairs import PairList, Surface
+from warp_resphys.core.energies.contact.surface_contact import SurfaceContact
+from warp_resphys.core.energies.contact.touching_bodies import HalfSpace
+from warp_resphys.core.energies.launcher import Launcher
+from warp_resphys.core.energies.materials import Corotated
+from warp_resphys.core.energies.tendons import Tendons
+from warp_resphys.core.fem.bodies import Body
+from warp_resphys.core.fem.scene import Scene
+from warp_resphys.core.mesh.boxes import box_hexahedra
+from warp_resphys.core.mesh.selection import select_vertices
+from warp_resphys.core.stepping.inputs import Inputs
 from warp_resphys.environments.grippers import ball_mesh
 from warp_resphys.experiment.build import choose_device
-from warp_resphys.fem.bodies import Body
-from warp_resphys.fem.scene import Scene
-from warp_resphys.mesh.boxes import box_hexahedra
-from warp_resphys.mesh.selection import select_vertices
-from warp_resphys.settings.body import SolverSettings
-from warp_resphys.settings.contact import HalfSpace
-from warp_resphys.stepping.inputs import Inputs
 
 from .measuring import free_unknowns, now, solves, take_turns
 

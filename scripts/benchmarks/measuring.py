@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from warp_resphys.dynamics.simulator import Simulator
-from warp_resphys.dynamics.trajectory import Motion
+from warp_resphys.core.dynamics.simulator import Simulator
+from warp_resphys.core.dynamics.trajectory import Motion
 from warp_resphys.io.progress import Progress
 
 CPU: Final = torch.device("cpu")

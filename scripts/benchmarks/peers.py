@@ -27,18 +27,18 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from warp_resphys.dynamics.simulator import Simulator
-from warp_resphys.energies.contact.obstacle_contact import Contact
-from warp_resphys.energies.materials import StableNeoHookean
+from warp_resphys.core.dynamics.simulator import Simulator
+from warp_resphys.core.dynamics.solver_settings import SolverSettings
+from warp_resphys.core.energies.contact.obstacle_contact import Contact
+from warp_resphys.core.energies.contact.touching_bodies import HalfSpace
+from warp_resphys.core.energies.materials import StableNeoHookean
+from warp_resphys.core.fem.bodies import Body
+from warp_resphys.core.mesh.boxes import box_tetrahedra
+from warp_resphys.core.mesh.quality import cell_volumes
+from warp_resphys.core.mesh.volume_mesh import Mesh
+from warp_resphys.core.stepping.state import State
 from warp_resphys.experiment.build import choose_device
-from warp_resphys.fem.bodies import Body
 from warp_resphys.io.errors import InputError
-from warp_resphys.mesh.boxes import box_tetrahedra
-from warp_resphys.mesh.quality import cell_volumes
-from warp_resphys.mesh.volume_mesh import Mesh
-from warp_resphys.settings.body import SolverSettings
-from warp_resphys.settings.contact import HalfSpace
-from warp_resphys.stepping.state import State
 
 from .measuring import now, take_turns
 

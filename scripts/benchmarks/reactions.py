@@ -14,9 +14,9 @@ from unittest.mock import patch
 import numpy as np
 import torch
 
-from warp_resphys.dynamics import time_step
-from warp_resphys.dynamics.energy_set import EnergySet
-from warp_resphys.dynamics.simulator import Simulator
+from warp_resphys.core.dynamics import time_step
+from warp_resphys.core.dynamics.energy_set import EnergySet
+from warp_resphys.core.dynamics.simulator import Simulator
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.settings.run import RunSettings
 

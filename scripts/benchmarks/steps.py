@@ -11,16 +11,16 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from warp_resphys.dynamics.assembly import HessianAssembly
-from warp_resphys.dynamics.simulator import Simulator
+from warp_resphys.core.dynamics.assembly import HessianAssembly
+from warp_resphys.core.dynamics.simulator import Simulator
+from warp_resphys.core.linalg.threads import threads_for
+from warp_resphys.core.stepping.inputs import Inputs
+from warp_resphys.core.stepping.state import State
 from warp_resphys.experiment.build import build_body, build_simulator, choose_device, finer
 from warp_resphys.io.machine import peak_memory_gib
 from warp_resphys.io.settings import parse
-from warp_resphys.linalg.threads import threads_for
 from warp_resphys.overrides import composed
 from warp_resphys.settings.run import RunSettings
-from warp_resphys.stepping.inputs import Inputs
-from warp_resphys.stepping.state import State
 
 from .measuring import free_unknowns, median_ms, now, solves, take_turns
 

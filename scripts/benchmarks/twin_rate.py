@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from warp_resphys.core.linalg.threads import threads_for
 from warp_resphys.io.errors import ConvergenceError, InputError, listed
 from warp_resphys.io.progress import Progress
 from warp_resphys.io.settings import parse
-from warp_resphys.linalg.threads import threads_for
 from warp_resphys.overrides import composed
 from warp_resphys.robot.loading import load, trial_names
 from warp_resphys.studies.live_twin import TwinSettings, trial_packets

@@ -30,9 +30,9 @@ from warp_resphys.control.polynomials import SquaredPolynomial
 from warp_resphys.control.reduction import reduce
 from warp_resphys.control.task import Task
 from warp_resphys.control.worlds import Laboratory, ReducedWorld
+from warp_resphys.core.stepping.rollout import states
 from warp_resphys.io.safe_files import read_array, read_hdf5
 from warp_resphys.settings.control import ReductionSettings
-from warp_resphys.stepping.rollout import states
 from warp_resphys.studies.live_twin import TwinSettings
 from warp_resphys.twin.reduced_estimator import ReducedEstimator
 

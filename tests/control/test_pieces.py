@@ -17,12 +17,12 @@ from warp_resphys.control.polynomials import Polynomial, SquaredPolynomial, best
 from warp_resphys.control.reduced_force import Evaluator, ReducedForce
 from warp_resphys.control.reduced_model import ReducedModel
 from warp_resphys.control.task import Path
+from warp_resphys.core.dynamics.gradient_check import central_difference
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.residuals.correction import Range
 from warp_resphys.learning.residuals.networks import ResidualForce, build_model
 from warp_resphys.settings.control import LimitsOfInputs
 from warp_resphys.settings.learning import NetworkSettings
-from warp_resphys.studies.gradient_check import central_difference
 
 SHAPES = ["circle", "eight", *"AQRX"]  # lines, a letter of several strokes, and round ones
 

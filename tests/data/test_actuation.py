@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from support.refusals import refuses
+from warp_resphys.core.energies.pressure import PRESSURE
+from warp_resphys.core.energies.tendons import TENSION
 from warp_resphys.data.input_response import check_inputs, draw_inputs
-from warp_resphys.energies.pressure import PRESSURE
-from warp_resphys.energies.tendons import TENSION
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.settings.played import SequenceSettings
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 import warp_resphys as wr
 from support.refusals import refuses
 from support.slopes import differences
+from warp_resphys.core.stepping.rotations import rotations
 from warp_resphys.data.camera import (
     CameraMarkers,
     Lens,
@@ -20,7 +21,6 @@ from warp_resphys.data.camera import (
     motion_axes,
     path_axes,
 )
-from warp_resphys.stepping.rotations import rotations
 
 X, Y, Z = np.eye(3)
 DOWN = np.array([0.0, 0.0, -9.8])

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from warp_resphys import DataFileError, InputError, box_tetrahedra, read_recording
+from warp_resphys.core.mesh.readers import read_mesh, read_surfaces, write_mesh
 from warp_resphys.data.recordings.segment import read_published_segment
 from warp_resphys.io import decoding
-from warp_resphys.mesh.readers import read_mesh, read_surfaces, write_mesh
 
 resource = pytest.importorskip("resource", reason="this system cannot limit a process")
 FRAMES = np.arange(12)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from warp_resphys.core.stepping.quantity import Quantity
 from warp_resphys.data.input_response import InputResponse, response_of, with_means
-from warp_resphys.stepping.quantity import Quantity
 
 STEP = 0.01
 

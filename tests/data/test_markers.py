@@ -18,6 +18,8 @@ from warp_resphys import (
     read_recording,
     select_vertices,
 )
+from warp_resphys.core.dynamics.gradient_check import central_difference
+from warp_resphys.core.stepping.rotations import closest_rotation, twisted
 from warp_resphys.data.markers import KINDS, bind_markers
 from warp_resphys.data.rigid_bodies import (
     angles,
@@ -29,8 +31,6 @@ from warp_resphys.data.rigid_bodies import (
     with_corners,
 )
 from warp_resphys.experiment.build import bound_markers, build_body, nominal_places
-from warp_resphys.stepping.rotations import closest_rotation, twisted
-from warp_resphys.studies.gradient_check import central_difference
 
 MESHES = {
     "hexahedra": box_hexahedra(divisions=(5, 2, 2)),

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from support.refusals import refuses
+from warp_resphys.core.energies.isochoric import stress
 from warp_resphys.data.material_tables import read_measured, read_membrane, read_test
-from warp_resphys.energies.isochoric import stress
 from warp_resphys.io.errors import DataFileError, ResphysWarning
 from warp_resphys.settings.data_kinds import TableSettings
 

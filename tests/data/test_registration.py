@@ -7,11 +7,11 @@ from scipy.spatial.transform import Rotation
 
 from support.refusals import refuses
 from warp_resphys import DataFileError, InputError, box_hexahedra, box_tetrahedra, read_recording
+from warp_resphys.core.mesh.surface import closest_points
+from warp_resphys.core.mesh.volume_mesh import boundary_triangles
 from warp_resphys.data.marker_names import assign
 from warp_resphys.data.recordings.processing import fill_gaps, find_release
 from warp_resphys.data.registration import RigidTransform, axes_rotation, kabsch, register_markers
-from warp_resphys.mesh.surface import closest_points
-from warp_resphys.mesh.volume_mesh import boundary_triangles
 
 BEAM = {
     "Tip - 1": (0.1, 0.015, 0.036),

@@ -15,8 +15,8 @@ import warp_resphys
 from support.refusals import refuses
 from warp_resphys import InputError, Robot, State
 from warp_resphys.control.worlds import World
+from warp_resphys.core.energies.contact.obstacle_surface import ObstacleSurface
 from warp_resphys.data.registration import kabsch
-from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
 from warp_resphys.environments.making import TASKS, make_vector
 from warp_resphys.environments.policies import ScriptedGrasp, errors_mm
 from warp_resphys.environments.tasks import FollowTask, Reach, ReachTask

@@ -7,8 +7,8 @@ import pytest
 
 from support.main_job import finish
 from warp_resphys import box_hexahedra, select_vertices
+from warp_resphys.core.mesh.volume_mesh import surface_vertices
 from warp_resphys.io.safe_files import read_hdf5, read_json
-from warp_resphys.mesh.volume_mesh import surface_vertices
 from warp_resphys.report.pages.ablation_page import MarkerErrors, verdict
 
 COUNTS = [1, 4, 33, 42]

@@ -15,7 +15,7 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
-from warp_resphys.energies.catalogue import make_material
+from warp_resphys.core.energies.catalogue import make_material
 from warp_resphys.io.errors import InputError, MeshError
 
 MESH = box_hexahedra((0.02, 0.01, 0.01), (2, 1, 1))

@@ -11,8 +11,8 @@ import warp_resphys
 from support.command_line import outcome, refusal
 from support.configured import composed
 from support.refusals import refuses
+from warp_resphys.core.energies.isochoric import stress
 from warp_resphys.data.material_tables import read_test
-from warp_resphys.energies.isochoric import stress
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.safe_files import read_json
 from warp_resphys.io.settings import parse

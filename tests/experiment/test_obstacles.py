@@ -24,12 +24,12 @@ from warp_resphys import (
     Twin,
     box_hexahedra,
 )
+from warp_resphys.core.energies.contact.obstacle_surface import ObstacleSurface
 from warp_resphys.data.base_motion import contact_inputs, prescribed, rigid
 from warp_resphys.data.recordings.processing import obstacle_motion
 from warp_resphys.data.recordings.recording import ARM, Recording
 from warp_resphys.data.trials import Trials
 from warp_resphys.energies import Box, FrictionPair, Sphere
-from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.report import true_contact
 from warp_resphys.experiment.simulate import target_settings

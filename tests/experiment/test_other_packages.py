@@ -17,6 +17,7 @@ from torch import nn
 import warp_resphys
 from support.configured import check, composed, settings
 from support.main_job import run_without_report
+from warp_resphys.core.dynamics.gradient_check import check_gradients
 from warp_resphys.energies import Energy, make_material
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.io.classes import ClassSettings, check_packages
@@ -27,7 +28,6 @@ from warp_resphys.io.settings import parse
 from warp_resphys.learning.residuals.networks import OwnNetwork
 from warp_resphys.robot.description import describe
 from warp_resphys.settings.run import RunSettings
-from warp_resphys.studies.gradient_check import check_gradients
 
 TEMPLATE = Path(__file__).parents[2] / "docs" / "examples" / "my_robot_physics"
 OPTIONS = [

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from support.configured import check, composed, settings
-from warp_resphys.energies.tendons import Tendons
+from warp_resphys.core.energies.route import Route
+from warp_resphys.core.energies.tendons import Tendons
+from warp_resphys.core.mesh.boxes import box_hexahedra
 from warp_resphys.experiment.actuators import build_muscles
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.io.settings import parse
-from warp_resphys.mesh.boxes import box_hexahedra
-from warp_resphys.settings.body import MuscleSettings, Route
+from warp_resphys.settings.body import MuscleSettings
 
 HALVES = [
     "mesh={kind: box_hexahedra, size: [0.05, 0.03, 0.03], divisions: [5, 2, 2]}",

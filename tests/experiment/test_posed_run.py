@@ -11,6 +11,8 @@ from support.configured import settings
 from support.main_job import finish, run_without_report
 from support.played_run import check_robots
 from support.report_page import FAILING
+from warp_resphys.core.mesh.arm_dimensions import ArmMesh
+from warp_resphys.core.stepping.inputs import Inputs
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_simulator, finer
 from warp_resphys.io.safe_files import read_array, read_hdf5, read_json
@@ -18,8 +20,7 @@ from warp_resphys.learning.identification.search import Identification
 from warp_resphys.report import render
 from warp_resphys.report.identification_section import trials_table
 from warp_resphys.settings.body import MaterialSettings
-from warp_resphys.settings.mesh import ArmMesh, FileMesh, HexahedralBox, RodMesh, ShippedArm
-from warp_resphys.stepping.inputs import Inputs
+from warp_resphys.settings.meshing import FileMesh, HexahedralBox, RodMesh, ShippedArm
 
 MODULUS = 420e3  # Pa, of the body that is recorded; the experiment expects 505 kPa
 OFFSETS = {"first": 1e-3, "second": -8e-4}  # m, around the axis, by which its tendons run elsewhere

@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from support.configured import settings
+from warp_resphys.core.mesh.chambers import find_chambers
 from warp_resphys.data.recordings.processing import valve_opening
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import build_body
@@ -14,7 +15,6 @@ from warp_resphys.experiment.files import DATASET
 from warp_resphys.experiment.recordings.reader import Reader
 from warp_resphys.experiment.splits import all_trials
 from warp_resphys.io.resuming import run_stages
-from warp_resphys.mesh.chambers import find_chambers
 from warp_resphys.pipeline import acquisition_stages
 
 

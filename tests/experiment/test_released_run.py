@@ -13,6 +13,7 @@ from support.configured import settings
 from support.main_job import run_without_report
 from support.refusals import refuses
 from warp_resphys import DataFileError
+from warp_resphys.core.mesh.boxes import box_tetrahedra
 from warp_resphys.experiment.experiment import ACTUATOR, LAW
 from warp_resphys.experiment.experiment import MODELS as ALL_MODELS
 from warp_resphys.experiment.mesh_check import check_mesh
@@ -22,7 +23,6 @@ from warp_resphys.io.safe_files import read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.identification import search
 from warp_resphys.learning.residuals.networks import NextState, ResidualForce, restore
-from warp_resphys.mesh.boxes import box_tetrahedra
 from warp_resphys.pipeline import learning_stages
 from warp_resphys.report.error_section import mesh_text
 from warp_resphys.report.wording import NO_BREAK_SPACE

@@ -7,7 +7,7 @@ import pytest
 
 from support.command_line import outcome, refusal
 from support.refusals import refuses
-from warp_resphys.energies.isochoric import stress
+from warp_resphys.core.energies.isochoric import stress
 from warp_resphys.experiment import material_stages
 from warp_resphys.experiment.material_stages import table_files
 from warp_resphys.io.errors import DataFileError

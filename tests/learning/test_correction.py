@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.clamped import clamped
 from support.slopes import check_slopes
 from warp_resphys import (
     Body,
@@ -20,6 +21,8 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
+from warp_resphys.core.stepping.rollout import rollout
+from warp_resphys.core.stepping.rotations import rotations
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.residuals import correction
@@ -27,8 +30,6 @@ from warp_resphys.learning.residuals.feedback import equilibrium_under_feedback
 from warp_resphys.learning.residuals.networks import NextState, ResidualForce, build_model
 from warp_resphys.learning.residuals.training import Samples, Trainer
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
-from warp_resphys.stepping.rollout import rollout
-from warp_resphys.stepping.rotations import rotations
 
 MESH = box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1))
 BODY, TIP = Body(MESH, fixed=select_vertices(MESH, x=0.0)), select_vertices(MESH, x=0.1)
@@ -513,3 +514,24 @@ def test_outputs_are_weighted_by_their_deviation(exponent, smallest):
     assert float(coder.scale.min() / coder.scale.max()) ** exponent == pytest.approx(
         smallest, rel=0.5
     )
+
+
+def test_an_environment_that_diverges_has_no_reaction_and_the_other_keeps_its_own():
+    beam = box_hexahedra((0.1, 0.03, 0.02), (6, 2, 2))
+    simulator = Simulator(
+        clamped(beam), Corotated(264e3, 0.45), solver=SolverSettings(on_failure="count")
+    )
+    thrown = torch.zeros(2, len(beam.vertices), 3, dtype=torch.float64)
+    thrown[1, -1] = 1e9
+    corrected = correction.CorrectedSimulator(simulator, lambda state, number: thrown)
+    after = corrected.step(simulator.rest_state(2), 0)
+    alone = correction.CorrectedSimulator(simulator, lambda state, number: thrown[:1]).step(
+        simulator.rest_state(), 0
+    )
+    assert after.lost.tolist() == [False, True]
+    assert torch.equal(simulator.reaction(after).forces[0], simulator.reaction(alone).forces[0])
+    assert simulator.reaction(after).forces[1].isnan().all()
+    lost = correction.CorrectedSimulator(simulator, lambda state, number: thrown[1:]).step(
+        simulator.rest_state(), 0
+    )
+    assert simulator.reaction(lost).forces.isnan().all()

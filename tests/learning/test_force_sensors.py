@@ -25,6 +25,7 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
+from warp_resphys.core.stepping.state import Reaction
 from warp_resphys.data.markers import MarkerMap
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning import (
@@ -42,7 +43,6 @@ from warp_resphys.learning.residuals.reconstruction_problems import (
 )
 from warp_resphys.learning.sensing import loads_at_steps, readings
 from warp_resphys.settings.learning import ReconstructionSettings, ReleaseSettings
-from warp_resphys.stepping.state import Reaction
 
 BAR = box_hexahedra(size=(0.02, 0.02, 0.06), divisions=(2, 2, 4))
 TRUE = {"youngs_modulus": 80e3}

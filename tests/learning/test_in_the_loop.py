@@ -16,6 +16,7 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
+from warp_resphys.core.dynamics.gradient_check import central_difference
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.replay import Replay
@@ -30,7 +31,6 @@ from warp_resphys.learning.sensing import at_steps
 from warp_resphys.learning.start import Start
 from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings
-from warp_resphys.studies.gradient_check import central_difference
 
 MESH = box_hexahedra(divisions=(2, 1, 1))
 TIP = select_vertices(MESH, x=0.1)

@@ -22,9 +22,9 @@ from warp_resphys import (
     evaluate,
     select_vertices,
 )
+from warp_resphys.core.energies.catalogue import unit_of
+from warp_resphys.core.energies.materials import Corotated
 from warp_resphys.energies import make_material
-from warp_resphys.energies.catalogue import unit_of
-from warp_resphys.energies.materials import Corotated
 from warp_resphys.learning.identification.law import (
     VISCOSITIES,
     LawClass,

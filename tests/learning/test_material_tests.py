@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from support.refusals import refuses
-from warp_resphys.energies.catalogue import law_content, read_law
-from warp_resphys.energies.isochoric import bulk_of, stress, stress_columns
+from warp_resphys.core.energies.catalogue import law_content, read_law
+from warp_resphys.core.energies.isochoric import bulk_of, stress, stress_columns
+from warp_resphys.core.energies.silicones import silicone_files
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.identification.material_tests import identify_from_tests
 from warp_resphys.learning.identification.specimens import MaterialTest, Specimen
-from warp_resphys.settings.silicones import silicone_files
 
 SILICONE = {"c10": 25e3, "ogden_3": 20e3}
 STRAINS = np.linspace(0.02, 1.0, 120)

@@ -17,8 +17,8 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
-from warp_resphys.dynamics import modes
-from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
+from warp_resphys.core.dynamics import modes
+from warp_resphys.core.dynamics.modes import RestStiffness, vibration_modes
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.residuals.coders import (
     actuation_coder,

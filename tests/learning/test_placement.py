@@ -22,6 +22,7 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
+from warp_resphys.core.stepping.rotations import twisted
 from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers, follow_vertices
 from warp_resphys.data.rigid_bodies import angles, arms
 from warp_resphys.learning import Bounds, Prior, search_parameters
@@ -31,7 +32,6 @@ from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, PlacedMa
 from warp_resphys.learning.replay import Replay
 from warp_resphys.learning.start import Start
 from warp_resphys.learning.trial_batch import TrialBatch
-from warp_resphys.stepping.rotations import twisted
 
 MESH = box_hexahedra((0.1, 0.03, 0.03), (5, 2, 2))
 REST = torch.as_tensor(MESH.vertices)

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Inputs, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys.core.dynamics.linearisation import Linearisation
 from warp_resphys.data.markers import KINDS, WHOLE_STATE, MarkerMap, bind_markers
-from warp_resphys.dynamics.linearisation import Linearisation
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.residuals.reconstruction import follow, make_reconstructor
 from warp_resphys.settings.learning import ReconstructionSettings

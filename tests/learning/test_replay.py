@@ -21,9 +21,11 @@ from warp_resphys import (
     Tendons,
     box_hexahedra,
 )
+from warp_resphys.core.dynamics.modes import vibration_modes
+from warp_resphys.core.fem.bodies import Body, PointMass
+from warp_resphys.core.mesh.selection import select_vertices
+from warp_resphys.core.stepping.rollout import sample
 from warp_resphys.data.markers import WHOLE_STATE
-from warp_resphys.dynamics.modes import vibration_modes
-from warp_resphys.fem.bodies import Body, PointMass
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.identification.misfit import Misfit
@@ -38,9 +40,7 @@ from warp_resphys.learning.release import (
 from warp_resphys.learning.replay import Replay
 from warp_resphys.learning.start import Start
 from warp_resphys.learning.trial_batch import TrialBatch
-from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.settings.learning import Bounds
-from warp_resphys.stepping.rollout import sample
 
 
 def simulator(masses=(), kind=Simulator, **options):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from support.refusals import refuses
-from warp_resphys.energies.isochoric import stress, stress_columns
+from warp_resphys.core.energies.isochoric import stress, stress_columns
 from warp_resphys.io.errors import InputError, ResphysWarning
 from warp_resphys.learning.identification.material_tests import identify_from_tests
 from warp_resphys.learning.identification.specimens import MaterialTest, Specimen

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 import warp_resphys as wr
 from support.slopes import differences
+from warp_resphys.core.mesh.surface import closest_of
 from warp_resphys.data.camera import PLACES, Lens, PlacedCamera
 from warp_resphys.experiment.pictures.camera_laboratory import depth_image
-from warp_resphys.mesh.surface import closest_of
 from warp_resphys.pictures import ClosedSurface, Cloud, Photo, PictureMisfit, SeenPose
 from warp_resphys.settings.learning import Bounds, Prior
 

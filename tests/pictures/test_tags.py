@@ -6,11 +6,11 @@ import torch
 
 from support.refusals import refuses
 from support.tags import draw_tag
+from warp_resphys.core.stepping.rotations import rotations
 from warp_resphys.data.camera import Lens
 from warp_resphys.io.errors import InputError
 from warp_resphys.pictures.tags import tag_poses
 from warp_resphys.settings.pictures import TagSettings
-from warp_resphys.stepping.rotations import rotations
 
 MATRIX = np.array([[900.0, 0.0, 330.0], [0.0, 900.0, 250.0], [0.0, 0.0, 1.0]])
 LENS = Lens(torch.as_tensor(MATRIX))

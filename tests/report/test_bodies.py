@@ -11,9 +11,9 @@ from matplotlib.image import imread
 
 from support.made_up_run import TRACKED, arm_settings, sag
 from warp_resphys import box_hexahedra, select_vertices
+from warp_resphys.core.mesh.chambers import find_chambers
 from warp_resphys.data.registration import register_markers
 from warp_resphys.experiment.build import shipped_arm
-from warp_resphys.mesh.chambers import find_chambers
 from warp_resphys.report import body_picture, render
 from warp_resphys.report.body_motions import ComparedMotion, DrivenBodies
 from warp_resphys.report.body_picture import (

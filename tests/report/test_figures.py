@@ -9,9 +9,9 @@ import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
-from warp_resphys.energies.pressure import PRESSURE
-from warp_resphys.mesh.boxes import box_hexahedra
+from warp_resphys.core.energies.contact.obstacle_surface import ObstacleSurface
+from warp_resphys.core.energies.pressure import PRESSURE
+from warp_resphys.core.mesh.boxes import box_hexahedra
 from warp_resphys.report import figures
 from warp_resphys.report.body_section import body_section, input_sequences, marker_paths
 from warp_resphys.report.control_section import followed_paths

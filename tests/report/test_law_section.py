@@ -12,7 +12,7 @@ import warp as wp
 
 from support.made_up_run import vertex_settings, write_vertex_run
 from support.report_page import report
-from warp_resphys.energies.convex_material import ConvexMaterial
+from warp_resphys.core.energies.convex_material import ConvexMaterial
 from warp_resphys.io.safe_files import read_json, write_json
 from warp_resphys.report import law_section
 from warp_resphys.report.law_section import ACROSS, ALONG, uniaxial_stress

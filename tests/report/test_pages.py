@@ -21,11 +21,11 @@ from support.made_up_run import (
 from support.refusals import refuses
 from support.report_page import report
 from warp_resphys import DataFileError, Mesh, box_hexahedra
+from warp_resphys.core.mesh.readers import write_mesh
 from warp_resphys.experiment import report as stage
 from warp_resphys.experiment.report import RunReader, make_folds_report
 from warp_resphys.io.resuming import StageContext
 from warp_resphys.io.safe_files import read_json, write_json
-from warp_resphys.mesh.readers import write_mesh
 from warp_resphys.report.body_section import paths_section
 from warp_resphys.report.data import best_and_worst
 from warp_resphys.report.motion_section import motion_of

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from support.scenes import MARGIN, SHADE, TOWARDS_VIEWER, body_scene
-from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
-from warp_resphys.mesh.plotting import BODY
-from warp_resphys.mesh.volume_mesh import Mesh, boundary_triangles
+from warp_resphys.core.mesh.boxes import box_hexahedra, box_tetrahedra
+from warp_resphys.core.mesh.plotting import BODY
+from warp_resphys.core.mesh.volume_mesh import Mesh, boundary_triangles
 from warp_resphys.report import render
 from warp_resphys.report.layers import OUTLINE, sharp_edges
 

@@ -12,9 +12,9 @@ from support.browser import until
 from support.made_up_run import arm_settings, vertex_settings, write_arm_run, write_vertex_run
 from support.report_page import FAILING, Page, report, skip_figures
 from warp_resphys import Body, Contact, box_hexahedra
+from warp_resphys.core.energies.contact.obstacle_surface import ObstacleSurface
+from warp_resphys.core.mesh.volume_mesh import boundary_triangles
 from warp_resphys.energies import Capsule, Sphere
-from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
-from warp_resphys.mesh.volume_mesh import boundary_triangles
 from warp_resphys.report import render
 from warp_resphys.report.body_motions import ComparedMotion
 from warp_resphys.report.layers import OBSTACLE

@@ -232,7 +232,7 @@ class TestFiles:
             body = UsdGeom.Mesh(stage.GetPrimAtPath("/robot/body"))
             at = np.array(body.GetPointsAttr().Get(3.0))
             kept = np.unique(
-                warp_resphys.mesh.volume_mesh.boundary_triangles(robot.simulator.body.mesh)
+                warp_resphys.core.mesh.volume_mesh.boundary_triangles(robot.simulator.body.mesh)
             )
             np.testing.assert_allclose(at, motion.q[3, 0].numpy()[kept], atol=1e-6)
             faces = np.array(body.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)

@@ -19,7 +19,7 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
-from warp_resphys.energies.convex_material import ConvexMaterial
+from warp_resphys.core.energies.convex_material import ConvexMaterial
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot

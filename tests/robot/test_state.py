@@ -7,9 +7,9 @@ import torch
 
 from support.refusals import refuses
 from warp_resphys import Body, InputError, Motion, Simulator, State, box_hexahedra
-from warp_resphys.mesh.motion_files import input_columns, write_csv
+from warp_resphys.core.mesh.motion_files import input_columns, write_csv
+from warp_resphys.core.stepping.quantity import Quantity
 from warp_resphys.robot.actuation import InputReader, RobotInput
-from warp_resphys.stepping.quantity import Quantity
 
 
 def moved(batch, **more):

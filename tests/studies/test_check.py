@@ -1,12 +1,15 @@
 """The check of a device, a part at a time, on the CPU; tests/validation runs all of it."""
 
+import copy
+import pickle
+
 import pytest
 import torch
 
 from support.command_line import outcome, refusal
+from warp_resphys.core.dynamics.gradient_check import GradientRow
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies import check
-from warp_resphys.studies.gradient_check import GradientRow
 
 CPU = torch.device("cpu")
 
@@ -59,3 +62,19 @@ def test_the_exit_code_says_whether_all_checks_passed(height, code, folder, monk
 
 def test_a_device_that_is_not_there(folder):
     assert refusal("check", "device=tpu") == "error: device is 'tpu': choose auto, cpu or cuda.\n"
+
+
+@pytest.mark.parametrize("name", check.MOTIONS)
+def test_copies_of_a_used_simulator_move_as_it_does(name, recwarn):
+    """For every kind of energy; buffers, factors and Warp's arrays stay behind, and no warning is
+    repeated.
+    """
+    sim = check.MOTIONS[name][0]()
+    expected = check.positions(sim)
+    copies = {"pickle": pickle.loads(pickle.dumps(sim)), "copy": copy.copy(sim)}
+    copies["deepcopy"] = copy.deepcopy(sim)
+    assert not recwarn
+    for way, other in copies.items():
+        torch.testing.assert_close(check.positions(other), expected, rtol=0.0, atol=1e-12, msg=way)
+    assert copies["copy"].body is sim.body
+    assert copies["deepcopy"].body is not sim.body

@@ -9,13 +9,13 @@ from matplotlib.image import imread
 from support.command_line import sentence, settings_of
 from support.refusals import refuses
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra, box_tetrahedra, read_mesh
+from warp_resphys.core.mesh.arm import mesh_arm, name_surfaces
+from warp_resphys.core.mesh.arm_dimensions import ArmMesh
+from warp_resphys.core.mesh.chambers import open_cavities
+from warp_resphys.core.mesh.quality import cell_volumes, scaled_jacobian
+from warp_resphys.core.mesh.volume_mesh import Mesh, boundary_faces, quadratic
 from warp_resphys.io.errors import InputError, MeshError, ResphysWarning
 from warp_resphys.mesh import read_surfaces, write_mesh
-from warp_resphys.mesh.arm import mesh_arm, name_surfaces
-from warp_resphys.mesh.chambers import open_cavities
-from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
-from warp_resphys.mesh.volume_mesh import Mesh, boundary_faces, quadratic
-from warp_resphys.settings.mesh import ArmMesh
 from warp_resphys.studies.inspection import Inspection, inspect, inspect_mesh
 
 

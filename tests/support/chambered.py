@@ -8,8 +8,8 @@ import torch
 
 from support.clamped import clamped
 from warp_resphys import Body, Fibres, Mesh, Pressure, box_hexahedra, box_tetrahedra, quadratic
-from warp_resphys.energies.base import PlacedEnergy
-from warp_resphys.energies.potential import IncrementalPotential, StepTerms
+from warp_resphys.core.energies.base import PlacedEnergy
+from warp_resphys.core.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.mesh import find_chambers
 
 SIZE, DIVISIONS = (0.06, 0.03, 0.02), (6, 3, 3)

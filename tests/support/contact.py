@@ -16,10 +16,10 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
-from warp_resphys.energies.contact.contact_points import vertex_areas
-from warp_resphys.energies.contact.pairs import PairList, Surface
-from warp_resphys.energies.launcher import Launcher
-from warp_resphys.settings.contact import Capsule, Cylinder, Obstacle, Sphere
+from warp_resphys.core.energies.contact.contact_points import vertex_areas
+from warp_resphys.core.energies.contact.pairs import PairList, Surface
+from warp_resphys.core.energies.contact.touching_bodies import Capsule, Cylinder, Obstacle, Sphere
+from warp_resphys.core.energies.launcher import Launcher
 
 G = 9.81
 KAPPA, D = 2e4, 1e-3  # Pa, m

@@ -8,7 +8,7 @@ import torch
 
 import warp_resphys
 from warp_resphys import Body, box_hexahedra
-from warp_resphys.dynamics.simulator import Simulator
+from warp_resphys.core.dynamics.simulator import Simulator
 from warp_resphys.learning.identification.search import Identification
 
 

@@ -4,9 +4,9 @@ from typing import Final
 
 import numpy as np
 
+from warp_resphys.core.mesh.plotting import BODY
+from warp_resphys.core.mesh.volume_mesh import Mesh, boundary_triangles
 from warp_resphys.data.camera import frame_of, view_axes
-from warp_resphys.mesh.plotting import BODY
-from warp_resphys.mesh.volume_mesh import Mesh, boundary_triangles
 from warp_resphys.report.layers import OUTLINE, Layer, RenderScene, View, sharp_edges
 
 TOWARDS_VIEWER: Final = (0.40, -1.0, 0.40)

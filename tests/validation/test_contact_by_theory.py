@@ -43,11 +43,18 @@ from warp_resphys import (
     SurfaceContact,
     box_hexahedra,
 )
-from warp_resphys.energies.contact.contact_points import vertex_areas
-from warp_resphys.mesh.boxes import box_tetrahedra
-from warp_resphys.mesh.selection import select_vertices
-from warp_resphys.settings.body import Rigid, SolverSettings
-from warp_resphys.settings.contact import Box, Capsule, Cylinder, HalfSpace, Sphere
+from warp_resphys.core.dynamics.solver_settings import SolverSettings
+from warp_resphys.core.energies.contact.contact_points import vertex_areas
+from warp_resphys.core.energies.contact.touching_bodies import (
+    Box,
+    Capsule,
+    Cylinder,
+    HalfSpace,
+    Sphere,
+)
+from warp_resphys.core.fem.rigid_region import Rigid
+from warp_resphys.core.mesh.boxes import box_tetrahedra
+from warp_resphys.core.mesh.selection import select_vertices
 
 SLIP = 1e-3  # v_s [m/s]
 AXIS = (0.3, -0.2, 0.9)

@@ -22,9 +22,9 @@ from warp_resphys import (
     SolverSettings,
     quadratic,
 )
+from warp_resphys.core.mesh.arm import mesh_arm
+from warp_resphys.core.mesh.arm_dimensions import ArmMesh
 from warp_resphys.mesh import find_chambers
-from warp_resphys.mesh.arm import mesh_arm
-from warp_resphys.settings.mesh import ArmMesh
 
 RUBBER = Corotated(264e3, 0.499, density=1070.0)
 CONVERGED = 31.63  # mm, under gravity

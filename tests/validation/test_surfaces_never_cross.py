@@ -38,16 +38,16 @@ from warp_resphys import (
     StableNeoHookean,
     SurfaceContact,
 )
-from warp_resphys.energies.contact.pairs import PairList, Surface
-from warp_resphys.energies.launcher import Launcher
-from warp_resphys.energies.tendons import Tendons
+from warp_resphys.core.energies.contact.pairs import PairList, Surface
+from warp_resphys.core.energies.contact.touching_bodies import Cylinder, HalfSpace
+from warp_resphys.core.energies.launcher import Launcher
+from warp_resphys.core.energies.tendons import Tendons
+from warp_resphys.core.fem.bodies import Body
+from warp_resphys.core.mesh.boxes import box_hexahedra, box_tetrahedra
+from warp_resphys.core.mesh.rod import rod
+from warp_resphys.core.mesh.selection import select_vertices
+from warp_resphys.core.mesh.volume_mesh import Mesh
 from warp_resphys.environments.grippers import ball_mesh
-from warp_resphys.fem.bodies import Body
-from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
-from warp_resphys.mesh.rod import rod
-from warp_resphys.mesh.selection import select_vertices
-from warp_resphys.mesh.volume_mesh import Mesh
-from warp_resphys.settings.contact import Cylinder, HalfSpace
 
 _SIDE = 0.1  # of Erleben's bodies [m]
 _GAP = 0.05  # that the upper one falls [m]

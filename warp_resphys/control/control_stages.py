@@ -11,6 +11,9 @@ from typing import Final
 
 import numpy as np
 
+from ..core.mesh.motion_files import input_columns, write_csv
+from ..core.stepping.rollout import rollout
+from ..core.stepping.state import State
 from ..data.trials import Trials
 from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN, RECEDING
 from ..io.arrays import FloatArray
@@ -21,14 +24,11 @@ from ..io.progress import Progress
 from ..io.resuming import StageContext, finished_record
 from ..io.safe_files import write_json
 from ..io.settings import parse
-from ..mesh.motion_files import input_columns, write_csv
 from ..report.body_motions import DrivenBodies
 from ..report.data import ControlResults, ReducedErrors, TrackingErrors
 from ..robot.loading import load
 from ..settings.control import ControlSettings
 from ..settings.stage_keys import StageSettings
-from ..stepping.rollout import rollout
-from ..stepping.state import State
 from .control_files import (
     BASELINES,
     PLANNED,

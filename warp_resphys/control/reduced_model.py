@@ -45,8 +45,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..core.energies.viscosity import relaxation
 from ..data.input_response import InputResponse
-from ..energies.viscosity import relaxation
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import ConvergenceError
 from .polynomials import Monomials, Polynomial, SquaredPolynomial, around

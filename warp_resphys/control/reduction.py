@@ -15,6 +15,7 @@ import scipy.linalg
 import torch
 from numpy.typing import ArrayLike
 
+from ..core.stepping.state import State
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, DataFileError
 from ..io.progress import Progress
@@ -23,7 +24,6 @@ from ..learning.residuals.coders import Coder
 from ..robot.construction import Plain
 from ..robot.robot import Robot
 from ..settings.control import ReductionSettings
-from ..stepping.state import State
 from .control_files import read_reduced, reduced_file, write_reduced
 from .polynomials import Polynomial, SquaredPolynomial, best_order, solve_ridge
 from .reduced_force import ReducedForce

@@ -9,9 +9,10 @@ import scipy.sparse
 import scipy.sparse.linalg
 import torch
 
+from ..core.energies.materials import MASS_DAMPING, PRONY_RATIOS, PRONY_TIME, VISCOUS
+from ..core.energies.viscosity import relaxation
+from ..core.stepping.state import State
 from ..data.input_response import InputResponse, draw_inputs, response_of
-from ..energies.materials import MASS_DAMPING, PRONY_RATIOS, PRONY_TIME, VISCOUS
-from ..energies.viscosity import relaxation
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import ConvergenceError, InputError
 from ..learning.residuals.correction import Learned
@@ -19,7 +20,6 @@ from ..robot.actuation import Given, RobotInput
 from ..robot.robot import Robot
 from ..settings.control import ReductionSettings
 from ..settings.played import SequenceSettings
-from ..stepping.state import State
 
 OnProgress = Callable[[int], None]
 

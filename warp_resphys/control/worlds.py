@@ -12,10 +12,13 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from ..core.dynamics.simulator import Simulator
+from ..core.energies.contact.obstacle_surface import ObstacleSurface
+from ..core.mesh.volume_mesh import boundary_triangles
+from ..core.stepping.rollout import states
+from ..core.stepping.state import State
 from ..coupling.mount import MountedState
 from ..data.registration import kabsch
-from ..dynamics.simulator import Simulator
-from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..experiment.build import build_body, simulation_device
 from ..experiment.files import REGISTRATION
 from ..experiment.laboratory import make_setup
@@ -25,13 +28,10 @@ from ..io.errors import InputError
 from ..io.resuming import finished_record
 from ..io.safe_files import read_json
 from ..io.settings import parse
-from ..mesh.volume_mesh import boundary_triangles
 from ..robot.description import Description
 from ..robot.robot import Robot
 from ..settings.observed import BindingSettings, MarkerSettings
 from ..settings.stage_keys import StageSettings
-from ..stepping.rollout import states
-from ..stepping.state import State
 from .reduced_model import ReducedModel, ReducedState
 
 _FURTHEST: Final = (

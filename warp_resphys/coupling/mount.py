@@ -37,12 +37,12 @@ import torch
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from ..core.stepping.state import State
 from ..io.arrays import BoolArray, Brief, FloatArray
 from ..io.errors import InputError, checks_types, listed
 from ..robot.actuation import BASE
 from ..robot.robot import Robot
 from ..robot.robot_scene import RobotScene
-from ..stepping.state import State
 from .mounting_body import HERE, MountingBody, twist
 
 _INTEGRATOR: Final = "implicit_euler"  # whose acceleration of the base is a

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..energies.contact.contact_points import MOTION
-from ..energies.contact.obstacle_contact import Contact
-from ..fem.bodies import Body
+from ..core.energies.contact.contact_points import MOTION
+from ..core.energies.contact.obstacle_contact import Contact
+from ..core.fem.bodies import Body
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError
 from ..io.text import read_rows

@@ -40,10 +40,10 @@ import yaml
 from numpy.typing import ArrayLike
 from typing_extensions import override
 
+from ..core.stepping.rotations import rotations
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, InputError
 from ..io.text import read_text
-from ..stepping.rotations import rotations
 from .markers import Markers, Observation
 
 SHIFTS: Final = ("camera_shift_1", "camera_shift_2", "camera_shift_3")  # m

@@ -24,10 +24,10 @@ from dataclasses import dataclass
 
 import torch
 
+from ..core.stepping.rotations import closest_rotation, rotations
+from ..core.stepping.state import Reaction
 from ..io.arrays import Brief
 from ..io.errors import InputError
-from ..stepping.rotations import closest_rotation, rotations
-from ..stepping.state import Reaction
 
 AXES = ("fx", "fy", "fz", "tx", "ty", "tz")  # forces [N], then moments [N m]
 UNITS = dict(zip(AXES, 3 * ["N"] + 3 * ["N m"], strict=True))

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..core.stepping.quantity import Quantity
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, InputError
 from ..settings.performed import WaveSettings
 from ..settings.played import SequenceSettings
-from ..stepping.quantity import Quantity
 from .input_network import InputNetwork
 
 Array = Any  # of NumPy or torch

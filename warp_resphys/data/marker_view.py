@@ -18,8 +18,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
+from ..core.stepping.rotations import closest_rotation
 from ..io.errors import InputError
-from ..stepping.rotations import closest_rotation
 from .markers import Markers
 
 _AXES = "xyz"

@@ -30,11 +30,11 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
+from ..core.mesh.surface import closest_points
+from ..core.mesh.volume_mesh import Mesh
+from ..core.stepping.rotations import closest_rotation
 from ..io.arrays import BoolArray, Brief, FloatArray, IntArray
 from ..io.errors import InputError, checks_types
-from ..mesh.surface import closest_points
-from ..mesh.volume_mesh import Mesh
-from ..stepping.rotations import closest_rotation
 
 _LEAST_PATCH = 4  # number of vertices that determine the rotation of a patch
 KINDS = ("normal", "frame", "rigid", "patch")

@@ -9,15 +9,15 @@ import h5py
 import numpy as np
 import torch
 
-from ..fem.bodies import Body
+from ..core.fem.bodies import Body
+from ..core.mesh.place import Place
+from ..core.mesh.selection import vertices_at
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.quantity import Quantity
+from ..core.stepping.rotations import rotations
 from ..io.arrays import BoolArray, Brief, FloatArray
 from ..io.errors import InputError
 from ..io.safe_files import atomic_hdf5, create, read_array, read_attribute, read_hdf5
-from ..mesh.selection import vertices_at
-from ..settings.mesh import Place
-from ..stepping.inputs import Inputs
-from ..stepping.quantity import Quantity
-from ..stepping.rotations import rotations
 from .base_motion import at_times, contact_inputs
 
 PAYLOAD: Final = Quantity(

@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 from typing_extensions import override
 
 from ..control.worlds import World
+from ..core.energies.contact.obstacle_surface import ObstacleSurface
+from ..core.mesh.volume_mesh import boundary_triangles
+from ..core.stepping.rollout import states
 from ..coupling.geoms import GeomSurfaces
 from ..coupling.mount import Mount, MountedState
 from ..coupling.mounting_body import mujoco_package
-from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..io.arrays import FloatArray, IntArray
-from ..mesh.volume_mesh import boundary_triangles
 from ..robot.robot import Robot
-from ..stepping.rollout import states
 from .grippers import BALL, FINGERS, finger_forces, gripper, squeeze_of
 
 ARM: Final = Path(__file__).with_name("arm.xml")

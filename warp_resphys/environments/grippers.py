@@ -8,20 +8,20 @@ import torch
 from typing_extensions import override
 
 from ..control.worlds import G, World, total_force
-from ..energies.contact.obstacle_contact import Contact
-from ..energies.contact.obstacle_surface import ObstacleSurface
-from ..energies.contact.surface_contact import SurfaceContact
-from ..fem.bodies import Body
+from ..core.energies.contact.obstacle_contact import Contact
+from ..core.energies.contact.obstacle_surface import ObstacleSurface
+from ..core.energies.contact.surface_contact import SurfaceContact
+from ..core.energies.contact.touching_bodies import HalfSpace
+from ..core.fem.bodies import Body
+from ..core.fem.rigid_region import Rigid
+from ..core.mesh.boxes import box_hexahedra
+from ..core.mesh.volume_mesh import Mesh, boundary_triangles
+from ..core.stepping.rollout import states
+from ..core.stepping.state import State
 from ..io.arrays import FloatArray, IntArray
-from ..mesh.boxes import box_hexahedra
-from ..mesh.volume_mesh import Mesh, boundary_triangles
 from ..robot.actuation import BASE, Given
 from ..robot.robot import Robot
 from ..robot.robot_scene import RobotScene
-from ..settings.body import Rigid
-from ..settings.contact import HalfSpace
-from ..stepping.rollout import states
-from ..stepping.state import State
 
 RISE: Final = 0.02  # of the gripper [m], which lifts a ball
 SPEED: Final = 0.02  # of the gripper [m/s]: it rises while it closes

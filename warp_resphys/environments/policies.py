@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..control.polynomials import Polynomial, around
+from ..core.linalg.threads import threads_for
 from ..coupling.mounting_body import base_pose, mujoco_package
 from ..io.arrays import FloatArray
 from ..io.errors import InputError, needs_extra
-from ..linalg.threads import threads_for
 from .arm_world import FLANGE, PALM, ArmWorld
 from .tasks import LIFT, GoalTask, Reach
 from .vector import AutoresetMode, Observation, RobotVectorEnv

@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..control.worlds import World
+from ..core.energies.contact.obstacle_surface import ObstacleSurface
+from ..core.stepping.rollout import states
 from ..data.camera import frame_of, side_axes
-from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError, needs_extra
 from ..report.layers import INK, Layer, RenderScene, View, body_layers, chain, obstacle_layers
 from ..report.render import Pixels, Renderer
-from ..stepping.rollout import states
 from .tasks import RobotTask
 
 with needs_extra("environments", "environments need"):

@@ -11,8 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..core.dynamics.simulator import Simulator
+from ..core.mesh.volume_mesh import surface_vertices
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.state import State
 from ..data.markers import MarkerMap
-from ..dynamics.simulator import Simulator
 from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
 from ..io.parts import Arrays, Parts, Report, TrialPart
@@ -20,11 +23,8 @@ from ..io.progress import show
 from ..io.resuming import Stage, StageContext, package_versions, resources_used
 from ..io.safe_files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json
 from ..learning.residuals.reconstruction import follow, make_reconstructor
-from ..mesh.volume_mesh import surface_vertices
 from ..settings.run import RunSettings
 from ..settings.stage_keys import SIMULATOR, StageSettings
-from ..stepping.inputs import Inputs
-from ..stepping.state import State
 from .build import build_body, build_simulator, simulation_device
 from .files import METRICS, REPORT
 from .folds import workers_for

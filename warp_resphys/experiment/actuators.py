@@ -6,25 +6,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, cast
 
-from ..energies.base import Energy
-from ..energies.contact.obstacle_contact import Contact
-from ..energies.contact.surface_contact import SurfaceContact
-from ..energies.fibres import Fibres
-from ..energies.medium import Medium
-from ..energies.muscles import CONTRACTION as MUSCLE_CONTRACTION
-from ..energies.muscles import STRESS, Muscle, Muscles
-from ..energies.pressure import PRESSURE, Pressure
-from ..energies.tendons import CONTRACTION, TENSION, Tendons
-from ..fem.bodies import Body
+from ..core.energies.base import Energy
+from ..core.energies.contact.obstacle_contact import Contact
+from ..core.energies.contact.surface_contact import SurfaceContact
+from ..core.energies.fibres import Fibres
+from ..core.energies.medium import Medium
+from ..core.energies.muscles import CONTRACTION as MUSCLE_CONTRACTION
+from ..core.energies.muscles import STRESS, Muscle, Muscles
+from ..core.energies.pressure import PRESSURE, Pressure
+from ..core.energies.tendons import CONTRACTION, TENSION, Tendons
+from ..core.fem.bodies import Body
+from ..core.mesh.chambers import Chamber, find_chambers, outer_surface
+from ..core.mesh.place import Place
+from ..core.mesh.readers import read_surfaces
+from ..core.mesh.selection import faces_at, select_cells
+from ..core.mesh.volume_mesh import Mesh
+from ..core.stepping.quantity import Quantity
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError, naming
-from ..mesh.chambers import Chamber, find_chambers, outer_surface
-from ..mesh.readers import read_surfaces
-from ..mesh.selection import faces_at, select_cells
-from ..mesh.volume_mesh import Mesh
 from ..settings.body import BodySettings, MuscleSettings
-from ..settings.mesh import FileMesh, Place
-from ..stepping.quantity import Quantity
+from ..settings.meshing import FileMesh
 
 # Driving input by group and the value of its key ``commanded``.
 _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {

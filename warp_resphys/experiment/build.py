@@ -15,31 +15,31 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from ..core.dynamics.plausibility import check_weight
+from ..core.dynamics.simulator import Simulator
+from ..core.energies.catalogue import make_material
+from ..core.energies.materials import Material
+from ..core.fem.bodies import Body, Glue
+from ..core.fem.coordinates import SymmetryPlane
+from ..core.mesh.arm import mesh_arm
+from ..core.mesh.arm_dimensions import ArmMesh
+from ..core.mesh.boxes import box_hexahedra, box_tetrahedra, boxes_hexahedra
+from ..core.mesh.readers import read_mesh
+from ..core.mesh.rod import rod
+from ..core.mesh.selection import select_cells, vertices_at
+from ..core.mesh.tetrahedra import fill_surface
+from ..core.mesh.volume_mesh import Mesh, check_mesh, join, quadratic
 from ..data.force_sensors import ForceSensor
 from ..data.marker_view import MarkerView
 from ..data.markers import BoundMarkers, JoinedMarkers, Markers, bind_markers, follow_vertices
 from ..data.rigid_bodies import arms, corners_of
-from ..dynamics.plausibility import check_weight
-from ..dynamics.simulator import Simulator
-from ..energies.catalogue import make_material
-from ..energies.materials import Material
-from ..fem.bodies import Body, Glue
-from ..fem.coordinates import SymmetryPlane
 from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import digest
 from ..io.errors import InputError, MeshError, naming
 from ..io.machine import available_memory_gib, find_device
 from ..io.settings import Settings
-from ..mesh.arm import mesh_arm
-from ..mesh.boxes import box_hexahedra, box_tetrahedra, boxes_hexahedra
-from ..mesh.readers import read_mesh
-from ..mesh.rod import rod
-from ..mesh.selection import select_cells, vertices_at
-from ..mesh.tetrahedra import fill_surface
-from ..mesh.volume_mesh import Mesh, check_mesh, join, quadratic
 from ..settings.body import BodySettings, MaterialSettings, SimulatorSettings
-from ..settings.mesh import (
-    ArmMesh,
+from ..settings.meshing import (
     BoxesMesh,
     FileMesh,
     HexahedralBox,

@@ -10,12 +10,13 @@ from pathlib import Path
 
 import torch
 
+from ..core.dynamics.simulator import Simulator
+from ..core.energies.catalogue import read_material
+from ..core.energies.convex_material import ConvexMaterial
+from ..core.fem.bodies import Body
+from ..core.mesh.selection import vertices_at
 from ..data.markers import WHOLE_STATE, MarkerMap
 from ..data.trials import RESTING
-from ..dynamics.simulator import Simulator
-from ..energies.catalogue import read_material
-from ..energies.convex_material import ConvexMaterial
-from ..fem.bodies import Body
 from ..io.errors import InputError, naming, needs_extra, number_of
 from ..learning.parameters import (
     MASS_FACTOR,
@@ -26,7 +27,6 @@ from ..learning.parameters import (
 )
 from ..learning.residuals.networks import core_factory
 from ..learning.residuals.reconstruction import make_reconstructor
-from ..mesh.selection import vertices_at
 from ..settings.data_kinds import RecordedData, ReleaseFromLoad
 from ..settings.learning import IdentifySettings, LawSettings
 from ..settings.performed import Trial

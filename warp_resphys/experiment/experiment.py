@@ -9,12 +9,12 @@ from typing import Any, Final
 import torch
 from numpy.typing import NDArray
 
+from ..core.dynamics.simulator import Simulator
+from ..core.fem.bodies import Body
 from ..data.input_network import InputNetwork
 from ..data.marker_view import ViewedMarkers
 from ..data.markers import WHOLE_STATE, Observation
 from ..data.trials import Trials
-from ..dynamics.simulator import Simulator
-from ..fem.bodies import Body
 from ..io.safe_files import read_array, read_attribute, read_hdf5, read_json
 from ..learning.comparison import Model
 from ..learning.identification.search import Identification

@@ -16,6 +16,11 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from ..core.dynamics.simulator import Simulator
+from ..core.mesh.selection import vertices_at
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.rollout import sample
+from ..core.stepping.state import State
 from ..data.base_motion import in_frame, rigid
 from ..data.force_sensors import AXES
 from ..data.input_response import draw_inputs, wave_inputs
@@ -24,7 +29,6 @@ from ..data.recordings.recording_files import write_recording
 from ..data.registration import RigidTransform, unit_vector
 from ..data.rigid_bodies import as_markers, corners_of, with_axes
 from ..data.trials import RESTING, STATIC, UNDER_INPUTS, payload_inputs
-from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray
 from ..io.errors import InputError, number_of
 from ..io.fan_out import ALONE, Workers
@@ -32,14 +36,10 @@ from ..io.parts import Arrays, Parts, Report, TrialPart, cut
 from ..io.resuming import StageContext
 from ..io.safe_files import write_json
 from ..learning.sensing import readings
-from ..mesh.selection import vertices_at
 from ..settings.performed import Trial
 from ..settings.played import LaboratorySettings
 from ..settings.run import RunSettings
 from ..settings.stage_keys import PLAYED, StageSettings
-from ..stepping.inputs import Inputs
-from ..stepping.rollout import sample
-from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
 from .build import bound_markers, build_body, build_simulator, force_sensor, nominal_places
 from .files import TRUTH

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..core.energies.catalogue import read_law
 from ..data.rigid_bodies import corners_of
 from ..data.trials import Trials, evenly
-from ..energies.catalogue import read_law
 from ..io.fan_out import ALONE, Workers
 from ..io.parts import Parts
 from ..io.resuming import StageContext, package_versions

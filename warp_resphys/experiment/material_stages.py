@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ..core.energies.catalogue import LawContent, law_path, read_law
+from ..core.energies.isochoric import bulk_of, shear_modulus
 from ..data.material_checks import MeasuredTable, check_unit
 from ..data.material_tables import read_measured, read_membrane
-from ..energies.catalogue import LawContent, law_path, read_law
-from ..energies.isochoric import bulk_of, shear_modulus
 from ..io.arrays import BoolArray, FloatArray
 from ..io.atomic import digest
 from ..io.errors import ConvergenceError, DataFileError, InputError, ResphysWarning, naming

@@ -13,14 +13,17 @@ import numpy as np
 import torch
 from pydantic import TypeAdapter
 
+from ..core.energies.catalogue import LawContent, modes_of
+from ..core.energies.contact.obstacle_surface import ObstacleSurface
+from ..core.fem.bodies import Body
+from ..core.fem.integration_points import principal_stretches, share_outside
+from ..core.mesh.chambers import Chamber
+from ..core.mesh.selection import vertices_at
+from ..core.mesh.volume_mesh import Mesh
 from ..data.recordings.marker_quality import Quality
 from ..data.registration import RegistrationSummary
 from ..data.rigid_bodies import as_markers, owners
 from ..data.trials import STATIC, Trials
-from ..energies.catalogue import LawContent, modes_of
-from ..energies.contact.obstacle_surface import ObstacleSurface
-from ..fem.bodies import Body
-from ..fem.integration_points import principal_stretches, share_outside
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError
 from ..io.resuming import StageContext
@@ -29,9 +32,6 @@ from ..learning.error_tables import ErrorTables
 from ..learning.identification.search import Identification
 from ..learning.intervals import half_widths_of
 from ..learning.parameters import configured_parameters
-from ..mesh.chambers import Chamber
-from ..mesh.selection import vertices_at
-from ..mesh.volume_mesh import Mesh
 from ..report.data import Driven, Film, FollowedPath, Recordings, RunReport, TrialResults
 from ..report.ranking import shown_metrics
 from ..report.wording import MODELS, models_in_figures

@@ -4,8 +4,8 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ..core.energies.catalogue import LawContent
 from ..data.registration import RegistrationSummary
-from ..energies.catalogue import LawContent
 from ..io.resuming import package_versions, resources_used
 from ..io.safe_files import read_json
 from ..learning.error_tables import ErrorTables

@@ -12,23 +12,23 @@ from functools import partial
 import numpy as np
 import torch
 
-from ..dynamics.simulator import Simulator
-from ..energies.catalogue import modes_of
-from ..fem.integration_points import principal_stretches, share_outside
+from ..core.dynamics.simulator import Simulator
+from ..core.energies.catalogue import modes_of
+from ..core.fem.integration_points import principal_stretches, share_outside
+from ..core.mesh.place import Place
+from ..core.mesh.selection import vertices_at
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.state import State
 from ..io.errors import ConvergenceError, InputError
 from ..io.parts import Checkpoint
 from ..io.progress import Progress
 from ..io.resuming import StageContext
 from ..io.safe_files import read_json, write_json
 from ..learning.metrics import marker_errors, summarise
-from ..mesh.selection import vertices_at
 from ..report.data import ShapeErrors
 from ..settings.body import BodySettings, SimulatorSettings
-from ..settings.mesh import Place
 from ..settings.played import ShapeSettings
 from ..settings.stage_keys import StageSettings
-from ..stepping.inputs import Inputs
-from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
 from .build import build_body, build_simulator
 from .experiment import LAW, Experiment

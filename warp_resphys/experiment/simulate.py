@@ -22,26 +22,26 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..core.dynamics.simulator import Simulator
+from ..core.mesh.place import Place
+from ..core.mesh.selection import vertices_at
+from ..core.mesh.surface import locate
+from ..core.mesh.volume_mesh import Mesh
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.rollout import states
+from ..core.stepping.rotations import twisted
+from ..core.stepping.state import Constants, State
 from ..data.base_motion import check_steps, contact_inputs, prescribed, prescribed_all, rigid
 from ..data.markers import WHOLE_STATE, MarkerMap, Observation
 from ..data.trials import GIVEN, Trials
-from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
 from ..io.parts import Arrays, Parts, Report, TrialPart
 from ..io.resuming import StageContext
-from ..mesh.selection import vertices_at
-from ..mesh.surface import locate
-from ..mesh.volume_mesh import Mesh
 from ..settings.body import SimulatorSettings, SteppedSettings, TargetSettings
 from ..settings.data_kinds import MovingBase, ReadingSettings, ReleaseFromTwist, SimulatedData
-from ..settings.mesh import Place
 from ..settings.performed import HeldSettings, MotionSettings, Trial
 from ..settings.stage_keys import StageSettings
-from ..stepping.inputs import Inputs
-from ..stepping.rollout import states
-from ..stepping.rotations import twisted
-from ..stepping.state import Constants, State
 from .build import build_body, build_simulator, whole_mesh
 from .files import DATASET
 

@@ -5,7 +5,7 @@ from statistics import mean, pstdev
 
 import torch
 
-from ..dynamics.simulator import Simulator
+from ..core.dynamics.simulator import Simulator
 from ..io.progress import Progress
 from ..io.resuming import StageContext
 from ..io.safe_files import write_json

@@ -13,11 +13,11 @@ from typing import Final
 import numpy as np
 import torch
 
+from ..core.dynamics.simulator import Simulator
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.state import State
 from ..data.trials import evenly
-from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, listed
-from ..stepping.inputs import Inputs
-from ..stepping.state import State
 from .evaluation import TrialRollout, evaluate
 from .observed_motions import Identified, ObservedMotions
 from .residuals.correction import Learned

@@ -11,8 +11,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..core.dynamics.simulator import Simulator
 from ..data.rigid_bodies import as_markers
-from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.parts import Parts, TrialPart
 from .error_tables import ComparedModels, ErrorTables, amplitudes, counted

@@ -13,14 +13,14 @@ from typing import Any, Final
 import numpy as np
 import torch
 
+from ..core.dynamics.simulator import Simulator
+from ..core.stepping.rollout import states
+from ..core.stepping.state import State
 from ..data.markers import NoPoints
 from ..data.trials import GIVEN, STATIC, Trials
-from ..dynamics.simulator import Simulator
 from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import ConvergenceError, InputError, checks_types, listed
 from ..io.parts import Arrays, Parts, Report, TrialPart, cut
-from ..stepping.rollout import states
-from ..stepping.state import State
 from .metrics import marker_errors, summarise
 from .observed_motions import Identified, ObservedMotions
 from .replay import Replay

@@ -13,19 +13,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..core.dynamics.frames import BaseFrame, base_movement
+from ..core.dynamics.simulator import Simulator
+from ..core.mesh.place import Place
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.state import State
 from ..data.force_sensors import ForceSensor
 from ..data.input_network import InputNetwork
 from ..data.input_response import InputResponse, with_means
 from ..data.markers import WHOLE_STATE, Markers, NoPoints, Observation, WholeState
 from ..data.trials import GIVEN, RELEASED, RESTING, STATIC, UNDER_INPUTS, Trials
-from ..dynamics.frames import BaseFrame, base_movement
-from ..dynamics.simulator import Simulator
 from ..io.arrays import Brief
 from ..io.errors import ConvergenceError, InputError, checks_types, in_short, listed
 from ..settings.learning import ActuationSettings, ReleaseSettings
-from ..settings.mesh import Place
-from ..stepping.inputs import Inputs
-from ..stepping.state import State
 from .parameters import split_name
 from .placement import PlacedMarkers, PlainPlacements, placement_of
 from .release import begin_inputs, estimate_release

@@ -12,9 +12,9 @@ from typing import Any, Final, TypeVar
 import numpy as np
 import torch
 
+from ..core.dynamics.simulator import Simulator
+from ..core.energies.tendons import OFFSETS, Tendons
 from ..data.input_response import RESPONSES, SLOPES
-from ..dynamics.simulator import Simulator
-from ..energies.tendons import OFFSETS, Tendons
 from ..io.errors import InputError, naming
 from ..settings.learning import Bounds
 

@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from ..dynamics.modes import align_degenerate_modes, fix_signs, vibration_modes
-from ..dynamics.simulator import Simulator
+from ..core.dynamics.modes import align_degenerate_modes, fix_signs, vibration_modes
+from ..core.dynamics.simulator import Simulator
+from ..core.linalg.least_squares import Move, Point, Problem, damped, minimise
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.state import State
 from ..io.errors import ConvergenceError
-from ..linalg.least_squares import Move, Point, Problem, damped, minimise
 from ..settings.learning import ReleaseSettings
-from ..stepping.inputs import Inputs
-from ..stepping.state import State
 from .replay import Parameters, Replay
 from .start import Start
 

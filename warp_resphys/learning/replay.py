@@ -15,15 +15,15 @@ from typing import Any
 
 import torch
 
+from ..core.dynamics.linearisation import Linearisation, first_order
+from ..core.dynamics.simulator import Constants, Simulator
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.rollout import on_steps, rollout, sample, states
+from ..core.stepping.state import State
 from ..data.input_network import InputNetwork
 from ..data.input_response import InputResponse, response_of
 from ..data.markers import Observation
-from ..dynamics.linearisation import Linearisation, first_order
-from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError, InputError
-from ..stepping.inputs import Inputs
-from ..stepping.rollout import on_steps, rollout, sample, states
-from ..stepping.state import State
 from .parameters import (
     HUNG,
     MASS_FACTOR,

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..core.dynamics.simulator import Simulator
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.rollout import sample
+from ..core.stepping.state import Constants, State
 from ..data.force_sensors import ForceSensor
-from ..dynamics.simulator import Simulator
 from ..io.errors import InputError, naming
-from ..stepping.inputs import Inputs
-from ..stepping.rollout import sample
-from ..stepping.state import Constants, State
 from .trial_batch import TrialBatch
 
 _NEAR = 1.5  # frames from a step to the nearest one in which something was seen

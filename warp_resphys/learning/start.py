@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from ..core.stepping.state import State
 from ..io.arrays import Brief
-from ..stepping.state import State
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from typing import Any, Self
 
 import torch
 
+from ..core.fem.bodies import Body
+from ..core.mesh.place import Place
+from ..core.stepping.inputs import Inputs
 from ..data.force_sensors import ForceSensor
 from ..data.trials import STATIC, Trials
-from ..fem.bodies import Body
 from ..io.arrays import Brief
 from ..io.errors import InputError
-from ..settings.mesh import Place
-from ..stepping.inputs import Inputs
 
 
 @dataclass(frozen=True)

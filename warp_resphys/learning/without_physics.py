@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 import torch
 
+from ..core.stepping.rollout import sample
 from ..data.driving import driving
 from ..data.trials import GIVEN, RESTING, Trials
 from ..io.arrays import BoolArray, FloatArray
-from ..stepping.rollout import sample
 from .baselines import BASELINES, REST, at_rest, predictions
 from .evaluation import used_frames
 from .observed_motions import ObservedMotions

@@ -23,11 +23,11 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from ..core.mesh.surface import closest_of, closest_points
+from ..core.mesh.volume_mesh import Mesh
 from ..data.camera import PlacedCamera
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError
-from ..mesh.surface import closest_of, closest_points
-from ..mesh.volume_mesh import Mesh
 from .outlines import Mask
 
 _STRAY: Final = (

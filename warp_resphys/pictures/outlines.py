@@ -19,9 +19,9 @@ import shapely
 import torch
 from scipy.spatial import cKDTree
 
+from ..core.mesh.volume_mesh import Mesh, boundary_triangles
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
-from ..mesh.volume_mesh import Mesh, boundary_triangles
 
 Mask = BoolArray
 

@@ -26,17 +26,17 @@ from typing import Final
 import numpy as np
 import torch
 
+from ..core.dynamics.simulator import Simulator
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.rollout import sample
 from ..data.camera import jacobians
 from ..data.markers import WHOLE_STATE
-from ..dynamics.simulator import Simulator
 from ..io.arrays import IntArray
 from ..io.errors import InputError
 from ..learning.parameters import MASS_FACTOR, identifiable_parameters
 from ..learning.replay import Replay
 from ..learning.start import Start
 from ..learning.trial_batch import TrialBatch
-from ..stepping.inputs import Inputs
-from ..stepping.rollout import sample
 
 RELEASE_DELAY: Final = "release_delay"  # s
 RELEASE_FORCES: Final = ("release_force_1", "release_force_2", "release_force_3")  # N

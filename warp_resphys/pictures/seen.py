@@ -11,14 +11,14 @@ import numpy as np
 import shapely
 import torch
 
+from ..core.dynamics.simulator import Simulator
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.rotations import rotations
 from ..data.camera import CORRECTIONS, PLACES, PlacedCamera
 from ..data.markers import Observation
-from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError
 from ..learning.parameters import constants_of, identifiable_parameters
-from ..stepping.inputs import Inputs
-from ..stepping.rotations import rotations
 from .clouds import Cloud
 from .outlines import ClosedSurface, Outline, Silhouette, visibility, within
 from .released_force import OF_RELEASE, ReleasedForce, at_row_times

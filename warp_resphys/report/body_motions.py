@@ -8,12 +8,12 @@ from typing import Final
 
 import numpy as np
 
+from ..core.energies.contact.obstacle_surface import ObstacleSurface
+from ..core.mesh.surface import closest_points
+from ..core.mesh.volume_mesh import Mesh, boundary_triangles
 from ..data.camera import axes_from_below, frame_of, height_of, motion_axes, path_axes
-from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..io.arrays import FloatArray, IntArray
 from ..learning.metrics import mean_distance
-from ..mesh.surface import closest_points
-from ..mesh.volume_mesh import Mesh, boundary_triangles
 from .layers import (
     BEHIND,
     MEASURED,

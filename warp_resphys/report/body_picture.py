@@ -12,15 +12,15 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
+from ..core.energies.contact.obstacle_surface import ObstacleSurface
+from ..core.mesh.chambers import Chamber
+from ..core.mesh.elements import ELEMENTS
+from ..core.mesh.plotting import BODY, FIXED
+from ..core.mesh.surface import closest_points
+from ..core.mesh.volume_mesh import Mesh, boundary_triangles, face_triangles
 from ..data.camera import frame_of, view_axes
-from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import atomic_path
-from ..mesh.chambers import Chamber
-from ..mesh.elements import ELEMENTS
-from ..mesh.plotting import BODY, FIXED
-from ..mesh.surface import closest_points
-from ..mesh.volume_mesh import Mesh, boundary_triangles, face_triangles
 from .data import Recordings
 from .figures import CHAMBER_COLOURS, WIDE, in_style
 from .layers import (

@@ -8,23 +8,23 @@ from typing import NotRequired, TypedDict
 
 import numpy as np
 
+from ..core.energies.catalogue import LawContent
+from ..core.energies.contact.obstacle_surface import ObstacleSurface
+from ..core.mesh.chambers import Chamber
+from ..core.mesh.volume_mesh import Mesh
+from ..core.stepping.quantity import Quantity
 from ..data.input_network import InputNetwork
 from ..data.input_response import NO_INPUT
 from ..data.recordings.marker_quality import Quality
 from ..data.registration import RegistrationSummary
-from ..energies.catalogue import LawContent
-from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..io.arrays import FloatArray, IntArray
 from ..learning.baselines import BASELINES
 from ..learning.error_tables import ErrorTables
 from ..learning.identification.search import Identification
 from ..learning.metrics import PublishedError, mean_distance, published_errors
 from ..learning.scores import HeldOutTest
-from ..mesh.chambers import Chamber
-from ..mesh.volume_mesh import Mesh
 from ..settings.data_kinds import ReleaseFromLoad
 from ..settings.run import RunSettings
-from ..stepping.quantity import Quantity
 from .page import Usage
 from .wording import MODELS
 

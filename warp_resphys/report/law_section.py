@@ -16,7 +16,7 @@ import numpy as np
 import scipy.optimize
 import torch
 
-from ..energies.catalogue import LawContent, make_material
+from ..core.energies.catalogue import LawContent, make_material
 from ..io.arrays import FloatArray
 from ..learning.identification.law import VISCOSITIES, is_shape
 from ..settings.body import MaterialSettings

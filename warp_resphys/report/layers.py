@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
+from ..core.mesh.volume_mesh import Mesh, boundary_faces
 from ..io.arrays import FloatArray, IntArray
-from ..mesh.volume_mesh import Mesh, boundary_faces
 
 INK: Final = "#1c2127"
 OUTLINE: Final = (

@@ -6,10 +6,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.dynamics.trajectory import Motion
+from ..core.mesh.volume_mesh import boundary_triangles
 from ..data.camera import frame_of, height_of, motion_axes
-from ..dynamics.trajectory import Motion
 from ..io.errors import InputError, checks_types
-from ..mesh.volume_mesh import boundary_triangles
 from .layers import (
     MEASURED,
     Layer,

@@ -18,10 +18,10 @@ from markupsafe import Markup
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
+from ..core.mesh.volume_mesh import boundary_triangles, surface_vertices
 from ..data.camera import frame_of, motion_axes, upwards
 from ..io.arrays import FloatArray
 from ..learning.metrics import mean_distance
-from ..mesh.volume_mesh import boundary_triangles, surface_vertices
 from . import figures
 from .body_motions import (
     LABORATORY_MARKERS,

@@ -12,24 +12,24 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from ..core.dynamics.frames import base_movement
+from ..core.dynamics.simulator import Simulator
+from ..core.energies.base import Energy
+from ..core.energies.contact.contact_points import MOTION
+from ..core.energies.materials import MASS_DAMPING
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.quantity import Quantity
+from ..core.stepping.rotations import rotations
+from ..core.stepping.state import ROBOT, State
 from ..data.base_motion import LARGEST_STEP
 from ..data.driving import time_since_change
 from ..data.input_network import InputNetwork
 from ..data.input_response import InputResponse, response_of, with_means
 from ..data.trials import PAYLOAD, payload_inputs
-from ..dynamics.frames import base_movement
-from ..dynamics.simulator import Simulator
-from ..energies.base import Energy
-from ..energies.contact.contact_points import MOTION
-from ..energies.materials import MASS_DAMPING
 from ..io.arrays import FloatArray
 from ..io.errors import InputError, listed
 from ..learning.parameters import MASS_FACTOR, command_of
 from ..learning.residuals.correction import LearnedPredictor
-from ..stepping.inputs import Inputs
-from ..stepping.quantity import Quantity
-from ..stepping.rotations import rotations
-from ..stepping.state import ROBOT, State
 from .description import Description
 
 BASE: Final = "base"

@@ -16,20 +16,20 @@ from typing import Any, Final
 import numpy as np
 import torch
 
+from ..core.dynamics.simulator import Simulator
+from ..core.energies.base import Energy
+from ..core.energies.convex_material import FibreFamily
+from ..core.energies.materials import Material
+from ..core.energies.muscles import Muscle
+from ..core.fem.bodies import Body, Glue, PointMass
+from ..core.fem.coordinates import SymmetryPlane
+from ..core.fem.scene import Scene
+from ..core.mesh.chambers import Chamber
+from ..core.mesh.volume_mesh import Mesh
 from ..data.markers import Observation
-from ..dynamics.simulator import Simulator
-from ..energies.base import Energy
-from ..energies.convex_material import FibreFamily
-from ..energies.materials import Material
-from ..energies.muscles import Muscle
-from ..fem.bodies import Body, Glue, PointMass
-from ..fem.coordinates import SymmetryPlane
-from ..fem.scene import Scene
 from ..io.classes import imported, package_of
 from ..io.errors import DataFileError, InputError, in_short
 from ..io.settings import Settings
-from ..mesh.chambers import Chamber
-from ..mesh.volume_mesh import Mesh
 
 _TARGET: Final = "_target_"
 _ARRAY: Final = "_array_"

@@ -13,12 +13,14 @@ import torch
 from numpy.typing import ArrayLike
 from pydantic import TypeAdapter
 
+from ..core.dynamics.simulator import Simulator
+from ..core.energies.materials import MASS_DAMPING
+from ..core.mesh.place import Place
+from ..core.mesh.volume_mesh import Mesh
 from ..data.input_network import InputNetwork
 from ..data.marker_view import ViewedMarkers
 from ..data.markers import Markers, Observation
 from ..data.rigid_bodies import corners_of, owners
-from ..dynamics.simulator import Simulator
-from ..energies.materials import MASS_DAMPING
 from ..experiment.build import bound_markers, build_body, build_simulator, marker_view_of
 from ..experiment.experiment import LEARNED, SIMFREE, Experiment, network_of
 from ..experiment.files import COMPARE, ERRORS, METRICS, fold_folder, read_if_there
@@ -35,10 +37,8 @@ from ..learning.metrics import ErrorSummary
 from ..learning.placement import PlacedMarkers, Placement, PlainPlacement
 from ..learning.residuals.correction import Learned, Range
 from ..learning.residuals.networks import NextState, restore
-from ..mesh.volume_mesh import Mesh
 from ..settings.body import MaterialSettings, SimulatorSettings
 from ..settings.learning import NetworkSettings
-from ..settings.mesh import Place
 from ..settings.observed import MarkerSettings
 from ..settings.stage_keys import StageSettings
 from .construction import Plain, made

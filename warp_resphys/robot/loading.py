@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..core.dynamics.trajectory import Motion
+from ..core.stepping.state import State
 from ..data.input_response import response_of
 from ..data.rigid_bodies import as_markers
 from ..data.trials import PAYLOAD, STATIC
-from ..dynamics.trajectory import Motion
 from ..experiment.build import choose_device
 from ..experiment.experiment import Experiment
 from ..io.errors import DataFileError, InputError, checks_types, listed
 from ..learning.parameters import split_name
-from ..stepping.state import State
 from .actuation import BASE
 from .description import SUFFIX, Description, describe, finished_experiment
 from .robot import Robot

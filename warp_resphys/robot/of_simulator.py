@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.dynamics.simulator import Simulator
+from ..core.fem.scene import Scene
 from ..data.markers import Observation, bind_markers
-from ..dynamics.simulator import Simulator
-from ..fem.scene import Scene
 from ..io.errors import InputError, in_short, listed
 from ..learning.identification.search import Identification
 from ..learning.observed_motions import Identified

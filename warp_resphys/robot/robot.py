@@ -9,10 +9,16 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from ..core.dynamics.frames import BaseFrame, VertexFrames
+from ..core.dynamics.simulator import Simulator
+from ..core.dynamics.trajectory import Motion
+from ..core.mesh.volume_mesh import Mesh
+from ..core.stepping.adjoints import refuse_transforms
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.rollout import rollout, states
+from ..core.stepping.rotations import rotations
+from ..core.stepping.state import State
 from ..data.markers import Observation
-from ..dynamics.frames import BaseFrame, VertexFrames
-from ..dynamics.simulator import Simulator
-from ..dynamics.trajectory import Motion
 from ..io.errors import ConvergenceError, InputError, checks_methods, checks_types
 from ..learning.evaluation import POSE_STEPS
 from ..learning.observed_motions import Identified
@@ -31,12 +37,6 @@ from ..learning.residuals.correction import (
 )
 from ..learning.residuals.feedback import equilibrium_under_feedback
 from ..learning.residuals.networks import NextState
-from ..mesh.volume_mesh import Mesh
-from ..stepping.adjoints import refuse_transforms
-from ..stepping.inputs import Inputs
-from ..stepping.rollout import rollout, states
-from ..stepping.rotations import rotations
-from ..stepping.state import State
 from .actuation import (
     BASE,
     Acting,

@@ -9,19 +9,19 @@ import torch
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from ..core.dynamics.frames import carried_rest
+from ..core.dynamics.simulator import Simulator
+from ..core.energies.contact.surface_contact import SurfaceContact
+from ..core.energies.materials import Material
+from ..core.fem.bodies import Body
+from ..core.fem.scene import Scene
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.state import State
 from ..data.base_motion import in_frame
 from ..data.registration import RigidTransform
-from ..dynamics.frames import carried_rest
-from ..dynamics.simulator import Simulator
-from ..energies.contact.surface_contact import SurfaceContact
-from ..energies.materials import Material
-from ..fem.bodies import Body
-from ..fem.scene import Scene
 from ..io.arrays import FloatArray
 from ..io.errors import InputError, checks_types
 from ..learning.parameters import constants_of
-from ..stepping.inputs import Inputs
-from ..stepping.state import State
 from .actuation import Given
 from .robot import Robot
 

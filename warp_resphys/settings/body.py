@@ -1,16 +1,19 @@
 """Settings of a body (material, parts, actuators, loads) and of its simulator."""
 
-from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from typing_extensions import override
 
+from ..core.dynamics.solver_settings import SolverSettings
+from ..core.energies.route import Route
+from ..core.energies.silicones import silicone_values
+from ..core.fem.rigid_region import Rigid
+from ..core.mesh.place import Direction, Place
 from ..io.classes import ClassSettings, package_of
 from ..io.settings import (
     Count,
     Many,
-    Natural,
     NotNegative,
     Positive,
     Settings,
@@ -20,11 +23,8 @@ from ..io.settings import (
     without_null,
 )
 from .contact import ContactSettings, ObstacleSettings, SurfaceContactSettings
-from .mesh import BoxSettings, Curve, Direction, Divisions, MeshSettings, Place, SymmetrySettings
-from .silicones import silicone_values
+from .meshing import BoxSettings, MeshSettings, SymmetrySettings
 
-SolverName = Literal["quasi_newton", "newton", "projective_dynamics"]
-LinearSolverName = Literal["auto", "banded", "tiled", "dense", "sparse", "pardiso"]
 Integrator = Literal["implicit_euler", "bdf2", "midpoint"]
 TimeStep = Annotated[float, Field(gt=0.0, le=10.0)]
 OwnEnergies = Annotated[
@@ -148,15 +148,6 @@ class MaterialSettings(_Parameters):
         }
 
 
-class Rigid(Settings):
-    """A nearly rigid region of a mesh, such as an end cap, a base plate or an insert."""
-
-    density: Positive = setting(1200.0, unit="kg/m^3")
-    stiffness: Positive = setting(
-        1.0e9, "kappa of the energy kappa V |F - R(F)|^2, which penalises deformation", "Pa"
-    )
-
-
 class PartSettings(Settings):
     """A further mesh of the body, with cells of the same kind,
     which form a region with the name of the part.
@@ -211,40 +202,6 @@ class FibreSettings(Settings):
     )
     toe: Positive = setting(1.0e-3, "strain over which fibres become taut")
     stiffness: NotNegative = setting(description="stiffness of a family, per length", unit="N/m")
-
-
-class Route(Settings):
-    """The route of a tendon."""
-
-    guides: Curve = setting(description="points through which it runs", unit="m")
-    pieces: Divisions = setting(1, "pieces into which each straight part is divided")
-    fixed_guides: Many[int] = setting((), "guides, from 0, that stay in the world")
-    entry_angle: NotNegative = setting(0.0, "contact angle before the first guide", "rad")
-    offsets: Annotated[Many[Direction | Curve], Field(max_length=2)] = setting(
-        (), "directions of identified offsets, common or per guide"
-    )
-
-    @model_validator(mode="after")
-    def _fits(self) -> Self:
-        count, fixed = len(self.guides), {*self.fixed_guides}
-        if any(first == second for first, second in pairwise(self.guides)):
-            raise ValueError("guides has two in a row at one place: leave one of them out.")
-        if not fixed <= {*range(count)}:
-            raise ValueError(
-                f"fixed_guides is {list(self.fixed_guides)}: the route has guides 0 to {count - 1}."
-            )
-        if len(fixed) == count:
-            raise ValueError(
-                "fixed_guides has all guides, so that the tendon does not pull "
-                "on the body: take one out."
-            )
-        for offset in self.offsets:
-            if isinstance(offset[0], tuple) and len(offset) != count:
-                raise ValueError(
-                    f"offsets has a direction for {len(offset)} guides: give three numbers, or "
-                    f"three for each of its {count} guides."
-                )
-        return self
 
 
 class TendonSettings(Settings):
@@ -304,27 +261,6 @@ class MediumSettings(Settings):
     tangential: NotNegative = setting(0.0, "coefficient of the drag along the surface")
     layer: NotNegative = setting(0.0, "thickness of the fluid that moves with the surface", "m")
     buoyancy: bool = setting(True, "whether the fluid carries the body")
-
-
-class SolverSettings(Settings):
-    """Settings of the solver of a step, `dynamics.nonlinear_solver`."""
-
-    name: SolverName = setting("quasi_newton", "method")
-    relative_tolerance: Annotated[float, Field(gt=0.0, le=0.1)] = setting(
-        1.0e-8, "residual over the forces in balance"
-    )
-    absolute_tolerance: NotNegative = setting(
-        1.0e-12, "residual at which a step is always solved", "N"
-    )
-    max_iterations: Natural = setting(500, "iterations after which a step fails")
-    memory: Natural = setting(12, "number of pairs that L-BFGS keeps")
-    linear_solver: LinearSolverName = setting("auto", "linear solver; pardiso needs a CPU")
-    factors: Literal["double", "single"] = setting(
-        "double", "precision of factors and L-BFGS pairs; results stay accurate"
-    )
-    on_failure: Literal["raise", "count"] = setting(
-        "raise", "effect of a failed step; count continues"
-    )
 
 
 class BodySettings(Settings):

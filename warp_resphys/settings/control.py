@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
+from ..core.mesh.place import Direction
 from ..io.settings import (
     Count,
     Natural,
@@ -15,7 +16,6 @@ from ..io.settings import (
     Word,
     setting,
 )
-from .mesh import Direction
 from .performed import different
 
 Model = Literal[

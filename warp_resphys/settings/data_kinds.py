@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
+from ..core.mesh.place import Direction, LengthUnit, Place
 from ..io.settings import (
     Count,
     Many,
@@ -18,7 +19,6 @@ from ..io.settings import (
     Word,
     setting,
 )
-from .mesh import Direction, LengthUnit, Place
 from .performed import (
     Axis,
     BaseMotion,

@@ -7,9 +7,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
+from ..core.mesh.place import Place
 from ..io.classes import ClassSettings
 from ..io.settings import Many, NotNegative, Positive, Settings, Some, Vector, Word, setting
-from .mesh import Place
 from .performed import CORNERS, Axis, different
 
 

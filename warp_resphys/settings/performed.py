@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, model_validator
 
+from ..core.mesh.place import Direction, Place
 from ..io.settings import (
     Count,
     Many,
@@ -19,7 +20,6 @@ from ..io.settings import (
     Word,
     setting,
 )
-from .mesh import Direction, Place
 
 # Held at rest until the release; released with the first frame; at rest until inputs are applied;
 # at rest under the inputs of the first frame; at rest as those do not act, such as of a slack

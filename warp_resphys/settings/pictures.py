@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
+from ..core.mesh.place import LengthUnit, Place
 from ..io.settings import (
     Count,
     Many,
@@ -19,7 +20,6 @@ from ..io.settings import (
     Word,
     setting,
 )
-from .mesh import LengthUnit, Place
 from .performed import LimitSettings, WithoutMotion, different
 
 _Fraction = Annotated[float, Field(ge=0.0, le=1.0)]

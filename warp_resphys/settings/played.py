@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from ..io.settings import Many, NotNegative, Positive, Settings, setting
 from .body import BodySettings, TargetSettings
-from .mesh import MeshSettings
+from .meshing import MeshSettings
 from .performed import HeldSettings, Trials, TrialTable
 
 

@@ -4,6 +4,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BeforeValidator, Field
 
+from ..core.mesh.place import Place
 from ..io.errors import InputError
 from ..io.settings import Natural, Pair, Settings, Word, parse, setting
 from .body import (
@@ -30,7 +31,6 @@ from .learning import (
     TrainerSettings,
     TrainingSettings,
 )
-from .mesh import Place
 from .observed import BindingSettings, ForceSensorSettings, MarkerSettings
 from .performed import MotionSettings, by_file
 from .pictures import PictureData

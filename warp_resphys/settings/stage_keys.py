@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 from pydantic import ConfigDict, PrivateAttr, model_validator
 from typing_extensions import override
 
+from ..core.mesh.place import Place
 from ..io.safe_files import to_plain
 from ..io.settings import Many, Settings, setting
 from .body import SimulatorSettings, TargetSettings
@@ -25,7 +26,6 @@ from .learning import (
     ReconstructionSettings,
     TrainingSettings,
 )
-from .mesh import Place
 from .observed import BindingSettings
 from .performed import Split, Trial
 from .played import LaboratorySettings, PlaySettings

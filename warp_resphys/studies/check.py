@@ -18,32 +18,33 @@ import torch
 import trimesh
 import warp as wp
 
-from ..dynamics.simulator import Simulator
-from ..energies.contact.obstacle_contact import Contact
-from ..energies.contact.obstacles import DistanceGrid
-from ..energies.contact.surface_contact import SurfaceContact
-from ..energies.fibres import Fibres
-from ..energies.materials import Corotated
-from ..energies.pressure import Pressure
-from ..energies.tendons import Tendons
+from ..core.dynamics.gradient_check import check_gradients, pose
+from ..core.dynamics.simulator import Simulator
+from ..core.dynamics.solver_settings import SolverName, SolverSettings
+from ..core.energies.contact.obstacle_contact import Contact
+from ..core.energies.contact.obstacles import DistanceGrid
+from ..core.energies.contact.surface_contact import SurfaceContact
+from ..core.energies.contact.touching_bodies import Box, Cylinder
+from ..core.energies.fibres import Fibres
+from ..core.energies.materials import Corotated
+from ..core.energies.pressure import Pressure
+from ..core.energies.tendons import Tendons
+from ..core.fem.bodies import Body
+from ..core.fem.scene import Scene
+from ..core.linalg.choice import LINEAR_SOLVERS
+from ..core.linalg.pardiso import has_pardiso
+from ..core.linalg.solver_names import LinearSolverName
+from ..core.mesh.boxes import box_hexahedra, box_tetrahedra
+from ..core.mesh.chambers import find_chambers
+from ..core.mesh.selection import select_vertices
+from ..core.mesh.volume_mesh import Mesh
+from ..core.stepping.inputs import Inputs
+from ..core.stepping.state import State
 from ..experiment.build import choose_device
-from ..fem.bodies import Body
-from ..fem.scene import Scene
 from ..io.errors import ResphysError
 from ..io.progress import Progress, show
 from ..io.settings import Settings, Word, setting
-from ..linalg.choice import LINEAR_SOLVERS
-from ..linalg.pardiso import has_pardiso
-from ..mesh.boxes import box_hexahedra, box_tetrahedra
-from ..mesh.chambers import find_chambers
-from ..mesh.selection import select_vertices
-from ..mesh.volume_mesh import Mesh
 from ..report.page import PageTable
-from ..settings.body import LinearSolverName, SolverName, SolverSettings
-from ..settings.contact import Box, Cylinder
-from ..stepping.inputs import Inputs
-from ..stepping.state import State
-from .gradient_check import check_gradients, pose
 
 SIZE: Final = (0.1, 0.03, 0.03)  # of a beam [m]
 BATCH, STEPS = 3, 4  # of a motion

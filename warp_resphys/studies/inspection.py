@@ -7,26 +7,28 @@ from typing import Any, Final
 import numpy as np
 from pydantic import model_validator
 
+from ..core.dynamics.mesh_error import NOTICED
+from ..core.dynamics.simulator import Simulator
+from ..core.energies.materials import Corotated
+from ..core.fem.bodies import Body
+from ..core.mesh.arm import name_surfaces
+from ..core.mesh.arm_dimensions import ArmMesh
+from ..core.mesh.chambers import find_chambers, open_cavities
+from ..core.mesh.place import Place
+from ..core.mesh.quality import cell_volumes, is_one_cell_thick, scaled_jacobian
+from ..core.mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
+from ..core.mesh.selection import vertices_at
+from ..core.mesh.tetrahedra import SURFACE_SUFFIXES
+from ..core.mesh.volume_mesh import Mesh, boundary_triangles, connected_parts, quadratic
 from ..data.recordings.bag import is_bag
 from ..data.recordings.recording_files import READERS
-from ..dynamics.mesh_error import NOTICED
-from ..dynamics.simulator import Simulator
-from ..energies.materials import Corotated
 from ..experiment.build import build_mesh
-from ..fem.bodies import Body
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
 from ..io.progress import aligned
 from ..io.settings import Many, Positive, Word, setting
-from ..mesh.arm import name_surfaces
-from ..mesh.chambers import find_chambers, open_cavities
-from ..mesh.quality import cell_volumes, is_one_cell_thick, scaled_jacobian
-from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
-from ..mesh.selection import vertices_at
-from ..mesh.tetrahedra import SURFACE_SUFFIXES
-from ..mesh.volume_mesh import Mesh, boundary_triangles, connected_parts, quadratic
 from ..report.body_picture import MeshSummary, mesh_picture
-from ..settings.mesh import ArmMesh, FileMesh, MeshSettings, Place, SurfaceMesh
+from ..settings.meshing import FileMesh, MeshSettings, SurfaceMesh
 from .recording_quality import RecordingInspection, inspect_recording
 
 _MOST_UNKNOWNS: Final = 40_000  # of quadratic cells, which are solved in some seconds

@@ -8,19 +8,19 @@ from typing import Final
 import numpy as np
 import torch
 
+from ..core.energies.contact.contact_points import MOTION
+from ..core.energies.contact.obstacle_contact import Contact
+from ..core.mesh.volume_mesh import surface_vertices
+from ..core.stepping.quantity import Quantity
+from ..core.stepping.state import State
 from ..data.markers import Markers
 from ..data.registration import RigidTransform, kabsch
-from ..energies.contact.contact_points import MOTION
-from ..energies.contact.obstacle_contact import Contact
 from ..experiment.build import bound_markers, marker_view_of
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
-from ..mesh.volume_mesh import surface_vertices
 from ..robot.actuation import BASE
 from ..robot.loading import RecordedTrial, recorded_trial
 from ..robot.robot import Robot
-from ..stepping.quantity import Quantity
-from ..stepping.state import State
 
 MATERIAL: Final = (
     "youngs_modulus",

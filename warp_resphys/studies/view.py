@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import warp as wp
 
-from ..energies.contact.obstacle_surface import ObstacleSurface
+from ..core.energies.contact.obstacle_surface import ObstacleSurface
+from ..core.mesh.volume_mesh import boundary_triangles, surface_vertices
 from ..io.errors import InputError, ResphysError, needs_extra
 from ..io.progress import show
 from ..io.settings import Count, Positive, Settings, Word, setting
-from ..mesh.volume_mesh import boundary_triangles, surface_vertices
 from ..report.layers import MEASURED, Layer, body_layers, obstacle_layers, sharp_edges
 from ..report.wording import TONES
 from ..robot.actuation import BASE

@@ -20,11 +20,11 @@ import numpy as np
 import scipy.special
 
 from ..control.controllers import conditioned
+from ..core.stepping.state import State
 from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import InputError
 from ..robot.actuation import Given
 from ..robot.robot import Robot
-from ..stepping.state import State
 from .belief import Belief, Correction
 
 # Errors over the size of the body: of a first shape, which may be anything, and so the most that

@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
+from ..core.stepping.state import State
 from ..data.rigid_bodies import as_markers
 from ..io.arrays import FloatArray
-from ..stepping.state import State
 
 REMEMBERED: Final = 400  # predictions
 _ENOUGH: Final = 20  # predictions from which intervals are scaled

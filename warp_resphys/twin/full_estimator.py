@@ -16,16 +16,16 @@ import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
+from ..core.energies.contact.obstacle_contact import Contact
+from ..core.energies.contact.surface_contact import SurfaceContact
+from ..core.stepping.quantity import Quantity
+from ..core.stepping.state import Reaction, State
 from ..data.trials import PAYLOAD
-from ..energies.contact.obstacle_contact import Contact
-from ..energies.contact.surface_contact import SurfaceContact
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError, listed
 from ..learning.parameters import check_names, identifiable_parameters
 from ..robot.actuation import Given
 from ..robot.robot import Robot
-from ..stepping.quantity import Quantity
-from ..stepping.state import Reaction, State
 from .belief import Belief
 from .estimator import TwinEstimator
 from .tangent import StepTangent, pulled_by, shifted

@@ -12,12 +12,12 @@ from typing_extensions import override
 from ..control.polynomials import Monomials
 from ..control.reduced_model import ReducedState
 from ..control.reduction import reduced_of
+from ..core.stepping.state import State
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..learning.residuals.correction import DIVERGENCE_DISTANCE
 from ..robot.actuation import Given, InputReader
 from ..robot.robot import Robot
-from ..stepping.state import State
 from .belief import Belief
 from .estimator import TwinEstimator
 

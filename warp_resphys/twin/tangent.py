@@ -15,12 +15,12 @@ import scipy.sparse.linalg
 import torch
 
 from ..control.sampling import linearised
-from ..energies.materials import VISCOUS
+from ..core.energies.materials import VISCOUS
+from ..core.stepping.integrators import make_integrator
+from ..core.stepping.state import State
 from ..io.arrays import FloatArray, IntArray
 from ..robot.actuation import FORCE, Given, InputReader
 from ..robot.robot import Robot
-from ..stepping.integrators import make_integrator
-from ..stepping.state import State
 
 _STEP: Final = 1e-2  # of the central differences, over the size of the body
 _SAME: Final = 1e-3  # relative difference of eigenvalues that belong together

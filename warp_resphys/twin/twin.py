@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from ..core.stepping.rollout import rollout
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..robot.actuation import Given, InputReader
 from ..robot.robot import Robot
-from ..stepping.rollout import rollout
 from .belief import Belief, Correction
 from .estimator import TwinEstimator
 from .forecasts import REMEMBERED, Disagreement, Estimate, Forecast, Scores, mean_mm

@@ -16,8 +16,8 @@ from typing import Any, Final
 import numpy as np
 import torch
 
+from ...core.energies.catalogue import law_content
 from ...data.camera import CORRECTIONS, PlacedCamera
-from ...energies.catalogue import law_content
 from ...io.errors import InputError
 from ...io.parts import Checkpoint
 from ...io.progress import Progress, show

@@ -13,17 +13,17 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from ...core.fem.bodies import Body
+from ...core.mesh.readers import METRES, read_mesh
+from ...core.mesh.selection import vertices_at
+from ...core.mesh.volume_mesh import Mesh, quadratic
 from ...data.camera import Lens, PlacedCamera
 from ...data.markers import bind_markers
-from ...fem.bodies import Body
 from ...io.arrays import FloatArray, IntArray
 from ...io.atomic import atomic_path, digest
 from ...io.errors import DataFileError, InputError, listed, naming, number_of
 from ...io.resuming import StageContext
 from ...io.safe_files import atomic_hdf5, create, read_array, read_hdf5
-from ...mesh.readers import METRES, read_mesh
-from ...mesh.selection import vertices_at
-from ...mesh.volume_mesh import Mesh, quadratic
 from ...pictures.clouds import Cloud
 from ...pictures.outlines import ClosedSurface, Outline
 from ...pictures.released_force import ReleasedForce

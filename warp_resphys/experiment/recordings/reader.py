@@ -9,6 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from ...core.dynamics.simulator import Simulator
+from ...core.mesh.selection import vertices_at
+from ...core.stepping.inputs import Inputs
 from ...data.marker_names import assign
 from ...data.marker_view import MarkerView
 from ...data.markers import follow_vertices
@@ -18,14 +21,11 @@ from ...data.recordings.recording_files import read_recording
 from ...data.registration import axes_rotation, unit_vector
 from ...data.rigid_bodies import corners_of, motion_between, owners, with_corners
 from ...data.trials import RESTING, STATIC, UNDER_INPUTS, payload_inputs
-from ...dynamics.simulator import Simulator
 from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, listed, naming, number_of
-from ...mesh.selection import vertices_at
 from ...settings.data_kinds import ReadingSettings
 from ...settings.performed import Trial
 from ...settings.run import RunSettings
-from ...stepping.inputs import Inputs
 from ..actuators import drive_of
 from ..build import (
     bound_markers,

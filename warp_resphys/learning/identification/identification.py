@@ -16,9 +16,9 @@ from statistics import fmean
 import numpy as np
 import torch
 
+from ...core.dynamics.simulator import Simulator
 from ...data.rigid_bodies import independent
 from ...data.trials import RELEASED, RESTING, Trials
-from ...dynamics.simulator import Simulator
 from ...io.errors import ConvergenceError, InputError, checks_types, listed, naming
 from ...io.parts import Checkpoint
 from ...io.settings import parse

@@ -16,12 +16,12 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from ...dynamics.simulator import Simulator
-from ...energies.catalogue import LawTest, TriedClass, law_content, unit_of
-from ...energies.convex_material import ConvexMaterial
-from ...energies.materials import Material
+from ...core.dynamics.simulator import Simulator
+from ...core.energies.catalogue import LawTest, TriedClass, law_content, unit_of
+from ...core.energies.convex_material import ConvexMaterial
+from ...core.energies.materials import Material
+from ...core.mesh.volume_mesh import Mesh
 from ...io.arrays import FloatArray
-from ...mesh.volume_mesh import Mesh
 from ...settings.learning import Bounds, Prior
 from .weak_form import Candidate, NormalEquations, WeakForm
 

@@ -10,11 +10,11 @@ from typing import Final
 import numpy as np
 import torch
 
+from ...core.dynamics.simulator import Simulator
+from ...core.fem.integration_points import principal_stretches
+from ...core.mesh.volume_mesh import Mesh
 from ...data.markers import WHOLE_STATE
-from ...dynamics.simulator import Simulator
-from ...fem.integration_points import principal_stretches
 from ...io.arrays import FloatArray
-from ...mesh.volume_mesh import Mesh
 from ...settings.learning import LawSettings
 from ..observed_motions import Identified, ObservedMotions
 from ..replay import Replay

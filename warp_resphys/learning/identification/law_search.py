@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from pydantic import TypeAdapter
 
+from ...core.dynamics.simulator import Simulator
+from ...core.energies.catalogue import LawContent, LawTest, TriedClass, make_material
+from ...core.energies.convex_material import ConvexMaterial
+from ...core.energies.materials import MASS_DAMPING
 from ...data.rigid_bodies import independent
 from ...data.trials import RELEASED, evenly
-from ...dynamics.simulator import Simulator
-from ...energies.catalogue import LawContent, LawTest, TriedClass, make_material
-from ...energies.convex_material import ConvexMaterial
-from ...energies.materials import MASS_DAMPING
 from ...io.errors import InputError, checks_types, naming
 from ...io.parts import Checkpoint
 from ...settings.learning import Bounds, LawSettings, Prior

@@ -26,9 +26,9 @@ from typing import Final
 import numpy as np
 import scipy.optimize
 
-from ...energies.catalogue import LawContent, LawTest, TriedClass, law_content
-from ...energies.convex_material import ConvexMaterial
-from ...energies.isochoric import (
+from ...core.energies.catalogue import LawContent, LawTest, TriedClass, law_content
+from ...core.energies.convex_material import ConvexMaterial
+from ...core.energies.isochoric import (
     KINDS,
     TERMS,
     bulk_of,
@@ -37,7 +37,7 @@ from ...energies.isochoric import (
     stress,
     stress_columns,
 )
-from ...fem.integration_points import LODE
+from ...core.fem.integration_points import LODE
 from ...io.arrays import BoolArray, Brief, FloatArray
 from ...io.errors import InputError, listed
 from .law import branches_of

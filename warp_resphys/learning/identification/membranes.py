@@ -24,20 +24,20 @@ import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
 
-from ...dynamics.simulator import Simulator
-from ...energies.catalogue import make_material
-from ...energies.isochoric import TERMS, bulk_of, shear_modulus
-from ...energies.pressure import Pressure
-from ...fem.bodies import Body
-from ...fem.coordinates import SymmetryPlane
+from ...core.dynamics.simulator import Simulator
+from ...core.dynamics.solver_settings import SolverSettings
+from ...core.energies.catalogue import make_material
+from ...core.energies.isochoric import TERMS, bulk_of, shear_modulus
+from ...core.energies.pressure import Pressure
+from ...core.fem.bodies import Body
+from ...core.fem.coordinates import SymmetryPlane
+from ...core.mesh.boxes import box_hexahedra
+from ...core.mesh.chambers import Chamber
+from ...core.mesh.selection import select_faces
+from ...core.mesh.volume_mesh import Mesh
+from ...core.stepping.inputs import Inputs
 from ...io.arrays import Brief, FloatArray, IntArray
 from ...io.errors import ConvergenceError, InputError
-from ...mesh.boxes import box_hexahedra
-from ...mesh.chambers import Chamber
-from ...mesh.selection import select_faces
-from ...mesh.volume_mesh import Mesh
-from ...settings.body import SolverSettings
-from ...stepping.inputs import Inputs
 
 _ANGLE: Final = 0.15  # of the wedge [rad]
 _HEIGHTS: Final = 6  # at which a membrane is simulated

@@ -24,11 +24,11 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from ...core.linalg.threads import in_threads, thread_count
+from ...core.stepping.state import State
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError, InputError
-from ...linalg.threads import in_threads, thread_count
 from ...settings.learning import Bounds
-from ...stepping.state import State
 from ..metrics import redundancy
 from ..parameters import check_names, exact, split_name
 from ..placement import Accuracy, DisplacedMarkers

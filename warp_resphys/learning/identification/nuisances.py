@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from ...core.stepping.rollout import sample
 from ...io.arrays import FloatArray
-from ...stepping.rollout import sample
 from ..placement import Accuracy, Placement, PlainPlacements, by_placement
 from ..replay import Replay, Sensed
 from ..start import Start

@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from ...energies.catalogue import LawContent, modes_of
-from ...energies.isochoric import TERMS, bulk_of
+from ...core.energies.catalogue import LawContent, modes_of
+from ...core.energies.isochoric import TERMS, bulk_of
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError, InputError
 from .material_tests import NOISE, SAMPLES, MeasuredLaw

@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
+from ...core.linalg.least_squares import Point, UnitBox, minimise
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError, DataFileError
 from ...io.parts import Checkpoint
 from ...io.progress import Progress
 from ...io.safe_files import read_json
-from ...linalg.least_squares import Point, UnitBox, minimise
 from ..observed_motions import Identified
 from .misfit import BoundedMisfit
 from .uncertainty import Uncertainty

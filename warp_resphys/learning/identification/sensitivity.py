@@ -16,16 +16,16 @@ from typing import Any, TypedDict
 import numpy as np
 import torch
 
+from ...core.dynamics.simulator import Simulator
+from ...core.linalg.threads import in_threads, thread_count
 from ...data.marker_view import ViewedMarkers
 from ...data.markers import Markers
 from ...data.rigid_bodies import as_markers, owners
 from ...data.trials import Trials
-from ...dynamics.simulator import Simulator
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError, listed
 from ...io.parts import cut
 from ...io.progress import Progress
-from ...linalg.threads import in_threads, thread_count
 from ..metrics import mean_distance
 from ..observed_motions import ObservedMotions
 from ..parameters import (

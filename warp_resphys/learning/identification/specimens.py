@@ -17,21 +17,21 @@ import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
 
-from ...dynamics.simulator import Simulator
-from ...energies.base import Energy
-from ...energies.catalogue import make_material
-from ...energies.contact.obstacle_contact import Contact
-from ...energies.isochoric import KINDS, TERMS, stress_columns
-from ...fem.bodies import Body
+from ...core.dynamics.simulator import Simulator
+from ...core.energies.base import Energy
+from ...core.energies.catalogue import make_material
+from ...core.energies.contact.obstacle_contact import Contact
+from ...core.energies.contact.touching_bodies import Sphere
+from ...core.energies.isochoric import KINDS, TERMS, stress_columns
+from ...core.fem.bodies import Body
+from ...core.mesh.boxes import box_hexahedra
+from ...core.mesh.rod import rod
+from ...core.mesh.selection import select_vertices
+from ...core.mesh.volume_mesh import Mesh
+from ...core.stepping.inputs import Inputs
 from ...io.arrays import BoolArray, Brief, FloatArray, IntArray
 from ...io.errors import ConvergenceError, InputError, ResphysWarning, number_of, warn
-from ...mesh.boxes import box_hexahedra
-from ...mesh.rod import rod
-from ...mesh.selection import select_vertices
-from ...mesh.volume_mesh import Mesh
-from ...settings.contact import Sphere
 from ...settings.specimen import LARGEST_SIZE
-from ...stepping.inputs import Inputs
 from .membranes import Membrane
 from .stray_samples import strays
 

@@ -23,13 +23,13 @@ import scipy.linalg
 import scipy.optimize
 import torch
 
-from ...dynamics.simulator import Simulator
-from ...energies.solid import VISCOUS_STRAIN
-from ...energies.tendon_forces import SEGMENT_TENSION
+from ...core.dynamics.simulator import Simulator
+from ...core.energies.solid import VISCOUS_STRAIN
+from ...core.energies.tendon_forces import SEGMENT_TENSION
+from ...core.stepping.inputs import Inputs
+from ...core.stepping.state import State
 from ...io.arrays import FloatArray
 from ...io.errors import InputError
-from ...stepping.inputs import Inputs
-from ...stepping.state import State
 
 # Values of parameters that give one unit of a coefficient, the others being zero.
 Candidate = Mapping[str, float]

@@ -28,10 +28,10 @@ from typing import Any, Final
 import torch
 from typing_extensions import override
 
+from ...core.dynamics.simulator import Simulator
+from ...core.energies.contact.contact_points import MOTION
 from ...data.input_network import Actuator, InputNetwork
 from ...data.input_response import InputResponse, with_means
-from ...dynamics.simulator import Simulator
-from ...energies.contact.contact_points import MOTION
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError, InputError, checks_types
 from ...io.progress import Progress

@@ -3,7 +3,7 @@
 import torch
 from torch import nn
 
-from ...dynamics.modes import RestStiffness
+from ...core.dynamics.modes import RestStiffness
 from ...io.errors import InputError
 
 # Modes and coordinates that vary less than this fraction of the largest are not amplified to unit

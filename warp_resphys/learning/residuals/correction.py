@@ -10,13 +10,13 @@ from typing import Any, Final
 
 import torch
 
-from ...dynamics.frames import BaseFrame, RestOnBase, VertexFrames
-from ...dynamics.simulator import Constants, Simulator
+from ...core.dynamics.frames import BaseFrame, RestOnBase, VertexFrames
+from ...core.dynamics.simulator import Constants, Simulator
+from ...core.stepping.inputs import Acts, Inputs
+from ...core.stepping.state import State
 from ...io.arrays import Brief
 from ...io.errors import InputError, in_short
 from ...io.safe_files import read_checkpoint, write_checkpoint
-from ...stepping.inputs import Acts, Inputs
-from ...stepping.state import State
 from ..scores import HeldOutTest
 from .networks import NextState, ResidualForce, StateMap, restore
 

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...dynamics.simulator import Constants, Simulator
+from ...core.dynamics.simulator import Constants, Simulator
+from ...core.stepping.inputs import Inputs
+from ...core.stepping.state import State
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError
-from ...stepping.inputs import Inputs
-from ...stepping.state import State
 from .correction import acts_of
 
 log = logging.getLogger(__name__)

@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 
+from ...core.dynamics.modes import RestStiffness
+from ...core.dynamics.simulator import Simulator
 from ...data.trials import GIVEN, RESTING, STATIC
-from ...dynamics.modes import RestStiffness
-from ...dynamics.simulator import Simulator
 from ...io.arrays import FloatArray
 from ...io.errors import InputError, checks_types
 from ...io.progress import Progress

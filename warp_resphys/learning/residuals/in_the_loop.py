@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from ...core.dynamics.frames import BaseFrame, VertexFrames
 from ...data.input_network import Actuator
-from ...dynamics.frames import BaseFrame, VertexFrames
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError
 from ...settings.learning import InTheLoopSettings, LoopSettings

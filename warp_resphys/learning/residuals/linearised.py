@@ -11,10 +11,10 @@ from typing import Final
 import torch
 from torch.nn.functional import pad
 
+from ...core.stepping.inputs import Inputs
+from ...core.stepping.rollout import sample
 from ...data.input_network import Actuator
 from ...data.input_response import InputResponse
-from ...stepping.inputs import Inputs
-from ...stepping.rollout import sample
 from ..replay import Replay
 from ..start import Start
 

@@ -13,11 +13,11 @@ import torch
 from torch import nn
 from typing_extensions import override
 
-from ...dynamics.modes import RestStiffness
+from ...core.dynamics.modes import RestStiffness
+from ...core.stepping.inputs import Acts
 from ...io.classes import ClassSettings
 from ...io.errors import InputError
 from ...settings.learning import NetworkSettings
-from ...stepping.inputs import Acts
 from .coders import Coder, actuation_coder, displacement_coder, empty_coder, nodal_coder, pod_coder
 
 _ARCHITECTURE = ("blocks", "layers", "width", "activation")

@@ -25,17 +25,17 @@ import torch
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from ...core.dynamics.simulator import Constants, Simulator
+from ...core.linalg.least_squares import minimise
+from ...core.linalg.threads import threads_for
+from ...core.stepping.inputs import Acts, Inputs
+from ...core.stepping.rollout import states
+from ...core.stepping.state import State
 from ...data.markers import WHOLE_STATE, Markers, Observation, WholeState
-from ...dynamics.simulator import Constants, Simulator
 from ...io.arrays import Brief
 from ...io.errors import ConvergenceError, InputError, checks_types
 from ...io.parts import Arrays, Parts, Report, TrialPart, cut
-from ...linalg.least_squares import minimise
-from ...linalg.threads import threads_for
 from ...settings.learning import ReconstructionSettings
-from ...stepping.inputs import Acts, Inputs
-from ...stepping.rollout import states
-from ...stepping.state import State
 from ..metrics import mean_distance
 from ..observed_motions import Identified, ObservedMotions
 from .reconstruction_problems import (

@@ -9,14 +9,14 @@ from typing import ClassVar
 import torch
 from typing_extensions import override
 
+from ...core.dynamics.linearisation import Linearisation
+from ...core.dynamics.simulator import Constants, Simulator
+from ...core.linalg.conjugate_gradients import LinearMap, conjugate_gradients
+from ...core.linalg.least_squares import Move, Point, Problem, ridge
+from ...core.stepping.inputs import Acts, Inputs
+from ...core.stepping.state import State
 from ...data.markers import WHOLE_STATE, Observation, WholeState
-from ...dynamics.linearisation import Linearisation
-from ...dynamics.simulator import Constants, Simulator
 from ...io.errors import ConvergenceError, InputError
-from ...linalg.conjugate_gradients import LinearMap, conjugate_gradients
-from ...linalg.least_squares import Move, Point, Problem, ridge
-from ...stepping.inputs import Acts, Inputs
-from ...stepping.state import State
 from ..replay import Prepared, Replay
 from ..sensing import loads_at_steps
 from ..start import Start

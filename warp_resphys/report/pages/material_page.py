@@ -8,7 +8,7 @@ from typing import Any, Final, TypedDict
 
 import numpy as np
 
-from ...energies.catalogue import LawContent
+from ...core.energies.catalogue import LawContent
 from ...io.arrays import FloatArray
 from ...settings.run import RunSettings
 from .. import figures

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from warp_resphys.core.mesh.surface import locate
+from warp_resphys.core.mesh.volume_mesh import Mesh
 from warp_resphys.data.markers import Markers
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.settings import Positive
-from warp_resphys.mesh.surface import locate
-from warp_resphys.mesh.volume_mesh import Mesh
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,12 @@ from typing import ClassVar
 import numpy as np
 import warp as wp
 
-from warp_resphys.energies.pointwise import PointwiseEnergy, in_cells
+from warp_resphys.core.energies.pointwise import PointwiseEnergy, in_cells
+from warp_resphys.core.mesh.place import Direction
+from warp_resphys.core.mesh.selection import select_cells
+from warp_resphys.core.stepping.quantity import Quantity, parameter
 from warp_resphys.io.settings import Positive
-from warp_resphys.mesh.selection import select_cells
-from warp_resphys.settings.mesh import BoxSettings, Direction
-from warp_resphys.stepping.quantity import Quantity, parameter
+from warp_resphys.settings.meshing import BoxSettings
 
 # The name is that of the input in Python, and in identified parameters such as
 # magnetic_field_factor.

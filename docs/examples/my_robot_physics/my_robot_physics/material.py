@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from warp_resphys.energies.materials import DensityMaterial
-from warp_resphys.stepping.quantity import Parameter, parameter
+from warp_resphys.core.energies.materials import DensityMaterial
+from warp_resphys.core.stepping.quantity import Parameter, parameter
 
 # Written in a function, quotients would be computed in single precision.
 C1, C2, C3, C4, C5 = (

@@ -13,7 +13,7 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
-from warp_resphys.studies.gradient_check import check_gradients
+from warp_resphys.core.dynamics.gradient_check import check_gradients
 
 LENGTH, SIDE, MAGNETISATION = 0.06, 0.006, 50e3
 MESH = box_hexahedra((LENGTH, SIDE, SIDE), (12, 1, 1), nodes=27)

@@ -13,7 +13,7 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
-from warp_resphys.studies.gradient_check import check_gradients
+from warp_resphys.core.dynamics.gradient_check import check_gradients
 
 TIGHT = SolverSettings(name="newton", relative_tolerance=1e-10)
 BEAM = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 1))

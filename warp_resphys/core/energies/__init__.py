@@ -1,0 +1,1 @@
+"""Energies of a body: materials, actuators, contact and surroundings."""

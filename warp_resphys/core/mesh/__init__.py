@@ -1,0 +1,1 @@
+"""Rest shapes: meshes, readers, mesh quality, surfaces, chambers, and parametric pneumatic arms."""

@@ -25,11 +25,11 @@ from hydra.plugins.config_source import ConfigSource
 from support.command_line import enable_loggers
 from support.main_job import IN_RUN, TINY, files, run, without_reports
 from support.scenes import body_scene
+from warp_resphys.core.mesh import readers
 from warp_resphys.core.mesh.boxes import box_hexahedra
 from warp_resphys.data.recordings import recording_files
 from warp_resphys.io import atomic, decoding
 from warp_resphys.io.settings import Settings
-from warp_resphys.mesh import readers
 from warp_resphys.report import figures, render
 
 wp.config.log_level = wp.LOG_WARNING

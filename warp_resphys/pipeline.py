@@ -6,46 +6,28 @@ on.
 
 import logging
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
-from inspect import signature
 from pathlib import Path
 from threading import Thread
-from typing import Any
 
 import torch
 
-from .control.control_files import BASELINES, plan_table, plans_file, reduced_file
-from .control.control_stages import drive, fit_baselines, plan_motions, reduce_robot
-from .control.task import motions_of
-from .core.energies.catalogue import law_path
+from .applications import FURTHER_STAGES, function_at, own_run
 from .experiment import files
-from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device
 from .experiment.checks import check_run
 from .experiment.digests import digest_of, files_read
-from .experiment.experiment import LEARNED, SIMFREE
 from .experiment.folds import Fold, intervals_of_folds, run_folds, workers_for
 from .experiment.laboratory import run_laboratory
-from .experiment.learning_stages import (
-    evaluate,
-    identify,
-    identify_law,
-    reconstruct,
-    train,
-    train_actuator,
-)
-from .experiment.mesh_check import check_mesh
 from .experiment.recordings.importing import import_recordings, import_scaled
-from .experiment.report import make_folds_report, make_report
+from .experiment.report import make_folds_report
 from .experiment.run_metrics import collect_metrics
-from .experiment.shapes import try_shapes
 from .experiment.simulate import simulate
-from .experiment.splits import folds_of, scaled_trials_of, split_of, test_groups, trials_of
-from .experiment.timing import time_models
-from .io.atomic import digest
+from .experiment.split_stages import SplitStages
+from .experiment.splits import folds_of, scaled_trials_of, split_of, trials_of
 from .io.fan_out import ALONE, Workers
 from .io.kernel_cache import start_quietly
 from .io.progress import show, title_of
@@ -66,20 +48,9 @@ from .report.ranking import recommended, shown_metrics
 from .report.sections import shapes_table
 from .report.verdict import results_table, verdict
 from .report.wording import duration_text
-from .settings.body import TargetSettings
-from .settings.control import ControlSettings
 from .settings.performed import Split, Trial
 from .settings.run import RunSettings
-from .settings.stage_keys import (
-    BATCH,
-    FIGURES,
-    IMPORTED,
-    LEARNING,
-    NETWORKS,
-    PLAYED,
-    SIMULATOR,
-    StageSettings,
-)
+from .settings.stage_keys import BATCH, IMPORTED, PLAYED, SIMULATOR, StageSettings
 
 log = logging.getLogger(__name__)
 
@@ -164,229 +135,16 @@ def learning_stages(
         acquired: fingerprint of the stage that wrote dataset.h5.
         workers: of the stages; those of the configuration if omitted.
     """
-    split_stages = _SplitStages(
+    split_stages = SplitStages(
         run, split, shared, acquired, workers_of(run) if workers is None else workers
     )
     split_stages.identification()
     split_stages.learning()
     split_stages.evaluation()
-    if run.control is not None:
-        split_stages.control(run.control)
+    for key, place in FURTHER_STAGES.items():
+        if getattr(run, key) is not None:
+            function_at(place)(split_stages)
     return split_stages.with_report()
-
-
-class _SplitStages:
-    """The stages of one split in the order in which they run; see `learning_stages`."""
-
-    def __init__(
-        self, run: RunSettings, split: Split, shared: str, acquired: str, workers: Workers
-    ) -> None:
-        self.run, self.split, self.workers = run, split, workers
-        self.stages: list[Stage] = []
-        # Stages of the identification, which all others follow.
-        self._identified: tuple[str, ...] = ()
-        self._common: dict[str, Any] = {
-            "files": files_read(run, run),
-            "shared": shared,
-            "split": split,
-        }
-        self._common["acquired"] = acquired
-
-    def add(
-        self,
-        name: str,
-        work: Callable[..., None],
-        outputs: tuple[str, ...],
-        keys: Sequence[str] = (),
-        upstream: Sequence[str] = (),
-        run: RunSettings | None = None,
-        **values: Any,
-    ) -> None:
-        """Adds a stage.
-
-        Args:
-            name: of the stage.
-            work: its function, which may take ``workers`` beside its context.
-            outputs: its files.
-            keys: of the run that it reads besides `LEARNING`.
-            upstream: stages besides the identification whose files it reads.
-            run: settings in place of those of the run.
-            values: derived from the run.
-        """
-        work = (
-            partial(work, workers=self.workers) if "workers" in signature(work).parameters else work
-        )
-        settings = StageSettings.reading(
-            run or self.run, *LEARNING, *keys, **{**self._common, **values}
-        )
-        self.stages.append(Stage(name, work, outputs, settings, (*self._identified, *upstream)))
-
-    def identification(self) -> None:
-        """Adds the identification of parameters and law,
-        its test on other bodies, and the learned actuator.
-        """
-        run = self.run.model_copy(update={"actuator": None, "control": None})
-        digests = self._common["files"]
-        if run.identify is not None:
-            self.add(
-                "identify",
-                identify,
-                (files.IDENTIFICATION,),
-                ("seed",),
-                run=run.model_copy(update={"law": None}),
-            )
-            self._identified = ("identify",)
-        if run.law is not None:
-            law = {} if run.law.file is None else {run.law.file: digest(law_path(run.law.file))}
-            self.add(
-                "identify_law",
-                identify_law,
-                (files.LAW_FILE,),
-                ("name",),
-                run=run,
-                files=digests | law,
-            )
-            self._identified += ("identify_law",)
-        if run.shapes:
-            bodies = [body for shape in run.shapes.values() for body in (shape, shape.target_body)]
-            keys = ("target", "shapes", "data.steps")
-            self.add(
-                "shapes",
-                try_shapes,
-                (files.SHAPES,),
-                keys,
-                run=run,
-                files=digests | files_read(run, *bodies),
-            )
-        if self.run.actuator is not None:
-            self.add("train_actuator", train_actuator, (files.ACTUATOR_FILE,))
-            self._identified += ("train_actuator",)
-
-    def learning(self) -> None:
-        """Adds the reconstruction of residual forces, and the training of the networks."""
-        run, split = self.run, self.split
-        if run.reconstruction is None:
-            return
-        # For the published comparison, where all vertices are observed, test trials are
-        # reconstructed, too.
-        compared = split.test if run.markers is None and run.law is None else ()
-        reconstructed = split.train + split.validation + compared
-        for model in (model for model in LEARNED if model in run.models and model != SIMFREE):
-            self.add(
-                *(f"reconstruct_{model}", reconstruct, (files.reconstruction_file(model),)),
-                ("reconstruction", "network.acts"),
-                model=model,
-                reconstructed=reconstructed,
-            )
-            outputs = (files.weights_file(model), files.training_file(model))
-            training = run.training_of(model)
-            upstream = (f"reconstruct_{model}",)
-            self.add(
-                f"train_{model}", train, outputs, NETWORKS, upstream, model=model, training=training
-            )
-        outputs = (files.weights_file(SIMFREE), files.training_file(SIMFREE))
-        training = run.training_of(SIMFREE)
-        needed = () if run.markers is None else ("reconstruct_resphys",)
-        alone = (
-            run
-            if run.markers is not None or run.target is None
-            else _without_simulator(run, run.target)
-        )
-        self.add(
-            "train_simfree",
-            train,
-            outputs,
-            NETWORKS,
-            needed,
-            alone,
-            model=SIMFREE,
-            training=training,
-        )
-
-    def evaluation(self) -> None:
-        """Adds the roll-outs of all models on the test trials,
-        their times, and the error of the mesh.
-        """
-        run, split, groups = self.run, self.split, test_groups(self.run, self.split)
-        calibration = (
-            (split.validation or split.train)
-            if run.markers is not None and folds_of(run) is None
-            else ()
-        )
-        made = [
-            stage.name
-            for stage in self.stages
-            if stage.name.startswith(("train_", "reconstruct_resphys"))
-        ]
-        self.add(
-            *("evaluate", evaluate, (files.ROLLOUTS, files.ERRORS)),
-            (*NETWORKS, "reconstruction", "published", "correct_uncorrected", "data.horizons"),
-            made,
-            groups=groups,
-            calibration=calibration,
-        )
-        if run.timing:
-            keys = (*NETWORKS, "reconstruction", "target")
-            self.add("time", time_models, (files.TIMES,), keys, made, groups=groups)
-        played = run.laboratory if run.is_laboratory else None
-        same = played is not None and (played.mesh, played.parts) == (run.mesh, run.parts)
-        if run.mesh_check is not None and not same:
-            first = {"1": groups["1"]}
-            self.add(
-                "mesh_check",
-                check_mesh,
-                (files.MESH_CHECK,),
-                (*NETWORKS, "mesh_check"),
-                groups=first,
-            )
-
-    def control(self, control: ControlSettings) -> None:
-        """Adds plans on the models, and with a simulated laboratory, driven motions."""
-        last, planned = control.models[-1], list[str]()
-        # The last model must reach the paths, so it is checked first.
-        for model in reversed(control.models):
-            first, second = f"reduce_{model}", f"plan_{model}"
-            planned += [first, second]
-            keys: tuple[str, ...] = ("seed", "control.reduction")
-            self.add(first, reduce_robot, (reduced_file(model),), keys, ("evaluate",), model=model)
-            outputs = (
-                plans_file(model),
-                *(plan_table(model, motion) for motion in motions_of(control)),
-            )
-            keys = (*FIGURES, "control.plan")
-            self.add(
-                second, plan_motions, outputs, keys, (first,), model=model, must_reach=model == last
-            )
-        if self.run.laboratory is None:
-            return
-        digests = self._common["files"] | files_read(self.run, self.run.laboratory)
-        keys = (*PLAYED, *FIGURES, "control.feedback")
-        self.add(
-            "baselines", fit_baselines, (BASELINES,), keys, ("evaluate",), model=last, files=digests
-        )
-        self.add(
-            "drive",
-            drive,
-            (files.DRIVEN, files.CONTROL),
-            (*PLAYED, "control"),
-            (*planned, "baselines"),
-            files=digests,
-        )
-
-    def with_report(self) -> list[Stage]:
-        """Returns all stages, with that of the report, which shows the whole configuration."""
-        shown = [
-            stage.name
-            for stage in self.stages
-            if stage.name in ("shapes", "evaluate", "time", "mesh_check", "drive")
-        ]
-        return [*self.stages, Stage("report", make_report, (files.REPORT,), self.run, tuple(shown))]
-
-
-def _without_simulator(run: RunSettings, target: TargetSettings) -> RunSettings:
-    """Settings of a network that replaces the simulator, without those that identify the latter."""
-    without = dict.fromkeys(("identify", "law", "actuator"))
-    return run.model_copy(update={"simulation": target.material, "shapes": {}, **without})
 
 
 def prepare(run: RunSettings) -> None:
@@ -400,16 +158,9 @@ def prepare(run: RunSettings) -> None:
     if run.device == "cpu" or not torch.cuda.is_available():
         # The networks are too small for several threads (linalg/threads.py).
         torch.set_num_threads(1)
-    if run.material_tests is not None:
-        from .experiment.material_stages import table_files
-
-        table_files(run.material_tests)
-    elif run.pictures is None:
-        check_run(run)
-    else:
-        from .experiment.pictures.picture_stages import check_pictures
-
-        check_pictures(run)
+    own = own_run(run)
+    check = check_run if own is None else function_at(own.check)
+    check(run)
 
 
 def acquire(run: RunSettings, folder: Path, wait: bool = False) -> tuple[list[Stage], str]:
@@ -431,21 +182,9 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
         InputError: an invalid setting.
     """
     prepare(run)
-    if run.pictures is not None:
-        from .experiment.pictures.picture_stages import picture_stages, print_pictures
-
-        run_stages(picture_stages(run, files_read(run, run)), folder)
-        print_pictures(run, folder)
-        return
-    if run.material_tests is not None:
-        from .experiment.material_stages import material_stages, print_material
-
-        run_stages(material_stages(run, run.material_tests), folder)
-        print_material(run, folder)
-        return
-    if run.ablation is not None:
-        run_stages(ablation_stages(run, files_read(run, run, run.target)), folder)
-        print_ablation(run, folder)
+    own = own_run(run)
+    if own is not None:
+        function_at(own.work)(run, folder)
         return
     if played := " and ".join(run.targets):
         log.info(

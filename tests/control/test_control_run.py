@@ -369,7 +369,7 @@ class TestDriving:
             driven.append(context.name)
             raise InputError("stopped.")
 
-        monkeypatch.setattr(pipeline, "drive", stop)
+        monkeypatch.setattr(control_stages, "drive", stop)
         code, err = run(*CONTROL, "control.horizon=0.2")
         assert code != 0
         assert "stopped." in err

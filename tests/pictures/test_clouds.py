@@ -14,8 +14,8 @@ import warp_resphys as wr
 from support.slopes import differences
 from warp_resphys.core.mesh.surface import closest_of
 from warp_resphys.data.camera import PLACES, Lens, PlacedCamera
-from warp_resphys.experiment.pictures.camera_laboratory import depth_image
 from warp_resphys.pictures import ClosedSurface, Cloud, Photo, PictureMisfit, SeenPose
+from warp_resphys.pictures.camera_laboratory import depth_image
 from warp_resphys.settings.learning import Bounds, Prior
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1), nodes=20)

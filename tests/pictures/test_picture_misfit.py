@@ -12,9 +12,9 @@ import torch
 import warp_resphys as wr
 from support.refusals import refuses
 from support.slopes import differences
-from warp_resphys.experiment.pictures.camera_laboratory import noisy_mask
 from warp_resphys.learning import Bounds, Prior, search_parameters
 from warp_resphys.pictures import ClosedSurface, Lens, Outline, PlacedCamera
+from warp_resphys.pictures.camera_laboratory import noisy_mask
 from warp_resphys.pictures.picture_misfit import PictureMisfit, values_of
 from warp_resphys.pictures.seen import Photo, SeenPose, distance_of
 

@@ -12,7 +12,6 @@ import torch
 import warp_resphys as wr
 from support.refusals import refuses
 from support.slopes import differences
-from warp_resphys.experiment.pictures.camera_laboratory import noisy_mask
 from warp_resphys.pictures import (
     ClosedSurface,
     Cloud,
@@ -23,6 +22,7 @@ from warp_resphys.pictures import (
     PlacedCamera,
     SeenPose,
 )
+from warp_resphys.pictures.camera_laboratory import noisy_mask
 from warp_resphys.pictures.released_force import ReleasedForce, at_row_times
 from warp_resphys.settings.learning import Bounds, Prior
 

@@ -9,6 +9,7 @@ import pytest
 
 from support.command_line import outcome
 from warp_resphys import pipeline
+from warp_resphys.experiment import split_stages
 
 REPOSITORY = Path(__file__).parents[2]
 STAGES = [
@@ -59,10 +60,11 @@ QUIET = ("hydra/job_logging=none", "hydra/hydra_logging=none")
 @contextlib.contextmanager
 def without_reports():
     """Replaces reports, which take most of a tiny run's time and have tests of their own."""
+    places = {"make_report": split_stages, "make_folds_report": pipeline}
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("make_report", "make_folds_report"):
+        for name, place in places.items():
             patch.setattr(
-                pipeline, name, lambda context: (context.run_dir / "report.html").write_text("-")
+                place, name, lambda context: (context.run_dir / "report.html").write_text("-")
             )
         yield
 

@@ -15,7 +15,9 @@ from ..core.mesh.motion_files import input_columns, write_csv
 from ..core.stepping.rollout import rollout
 from ..core.stepping.state import State
 from ..data.trials import Trials
+from ..experiment.digests import files_read
 from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN, RECEDING
+from ..experiment.split_stages import SplitStages
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
@@ -27,6 +29,7 @@ from ..io.settings import parse
 from ..report.body_motions import DrivenBodies
 from ..report.data import ControlResults, ReducedErrors, TrackingErrors
 from ..robot.loading import load
+from ..settings import stage_keys
 from ..settings.control import ControlSettings
 from ..settings.stage_keys import StageSettings
 from .control_files import (
@@ -57,6 +60,43 @@ from .worlds import Laboratory
 _RECEDING: Final = (1e-2, 1)
 _PRESSED: Final = 0.3  # share of the range by which inputs are changed to measure the Jacobian
 _ALL_SEEN: Final = 0.5  # share of a trial's frames that must show all markers, for the linear model
+
+
+def add_control(split: SplitStages) -> None:
+    """Adds plans on the models, and with a simulated laboratory, driven motions."""
+    control = split.run.control
+    assert control is not None
+    last = control.models[-1]
+    planned = list[str]()
+    # The last model must reach the paths, so it is checked first.
+    for model in reversed(control.models):
+        first, second = f"reduce_{model}", f"plan_{model}"
+        planned += [first, second]
+        keys: tuple[str, ...] = ("seed", "control.reduction")
+        split.add(first, reduce_robot, (reduced_file(model),), keys, ("evaluate",), model=model)
+        outputs = (
+            plans_file(model),
+            *(plan_table(model, motion) for motion in motions_of(control)),
+        )
+        keys = (*stage_keys.FIGURES, "control.plan")
+        split.add(
+            second, plan_motions, outputs, keys, (first,), model=model, must_reach=model == last
+        )
+    if split.run.laboratory is None:
+        return
+    digests = split.digests | files_read(split.run, split.run.laboratory)
+    keys = (*stage_keys.PLAYED, *stage_keys.FIGURES, "control.feedback")
+    split.add(
+        "baselines", fit_baselines, (BASELINES,), keys, ("evaluate",), model=last, files=digests
+    )
+    split.add(
+        "drive",
+        drive,
+        (DRIVEN, CONTROL),
+        (*stage_keys.PLAYED, "control"),
+        (*planned, "baselines"),
+        files=digests,
+    )
 
 
 def reduce_robot(context: StageContext) -> None:

@@ -20,12 +20,13 @@ from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
 from ..io.parts import Arrays, Parts, Report, TrialPart
 from ..io.progress import show
-from ..io.resuming import Stage, StageContext, package_versions, resources_used
+from ..io.resuming import Stage, StageContext, package_versions, resources_used, run_stages
 from ..io.safe_files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json
 from ..learning.residuals.reconstruction import follow, make_reconstructor
 from ..settings.run import RunSettings
 from ..settings.stage_keys import SIMULATOR, StageSettings
 from .build import build_body, build_simulator, simulation_device
+from .digests import files_read
 from .files import METRICS, REPORT
 from .folds import workers_for
 from .simulate import build_target, weights
@@ -81,6 +82,12 @@ def check_ablation(run: RunSettings, simulator: Simulator) -> None:
         )
     probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
     make_reconstructor(simulator, run.reconstruction, probe)
+
+
+def run_ablation(run: RunSettings, folder: Path) -> None:
+    """Runs the stages of the study, and prints the errors."""
+    run_stages(ablation_stages(run, files_read(run, run, run.target)), folder)
+    print_ablation(run, folder)
 
 
 def print_ablation(run: RunSettings, folder: Path) -> None:

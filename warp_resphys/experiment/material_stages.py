@@ -16,7 +16,7 @@ from ..io.arrays import BoolArray, FloatArray
 from ..io.atomic import digest
 from ..io.errors import ConvergenceError, DataFileError, InputError, ResphysWarning, naming
 from ..io.progress import show
-from ..io.resuming import Stage, StageContext, package_versions, resources_used
+from ..io.resuming import Stage, StageContext, package_versions, resources_used, run_stages
 from ..io.safe_files import read_json, write_json
 from ..learning.identification.material_tests import MeasuredLaw, identify_from_tests
 from ..learning.identification.membranes import Membrane
@@ -418,6 +418,23 @@ def material_metrics(folder: Path) -> MaterialMetrics:
         "versions": package_versions(),
         "device": "cpu",
     }
+
+
+def check_material(run: RunSettings) -> None:
+    """Checks that there are files with tests.
+
+    Raises:
+        InputError: there are none.
+    """
+    assert run.material_tests is not None
+    table_files(run.material_tests)
+
+
+def run_material(run: RunSettings, folder: Path) -> None:
+    """Runs the stages of tests of a material, and prints its law."""
+    assert run.material_tests is not None
+    run_stages(material_stages(run, run.material_tests), folder)
+    print_material(run, folder)
 
 
 def print_material(run: RunSettings, folder: Path) -> None:

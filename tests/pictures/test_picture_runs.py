@@ -24,16 +24,16 @@ from support.main_job import IN_RUN, QUIET
 from support.tags import draw_tag
 from warp_resphys.core.energies.catalogue import read_law
 from warp_resphys.core.mesh.volume_mesh import boundary_triangles
-from warp_resphys.experiment.pictures import picture_stages as stages
-from warp_resphys.experiment.pictures.camera_laboratory import depth_image, noisy_mask
-from warp_resphys.experiment.pictures.picture_stages import picture_stages
 from warp_resphys.io.resuming import run_stages
 from warp_resphys.io.safe_files import read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.identification import search
 from warp_resphys.pictures import ClosedSurface, Lens, Outline, PlacedCamera
+from warp_resphys.pictures import picture_stages as stages
+from warp_resphys.pictures.camera_laboratory import depth_image, noisy_mask
+from warp_resphys.pictures.picture_stages import picture_stages
+from warp_resphys.pictures.pictures_page import PictureResult, picture_verdict
 from warp_resphys.pictures.scene_files import read_tracked
-from warp_resphys.report.pages.pictures_page import PictureResult, picture_verdict
 from warp_resphys.settings.run import RunSettings
 
 SIZE = (640, 360)

@@ -13,18 +13,18 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ...io.arrays import FloatArray
-from ...io.errors import listed, number_of
-from ...io.safe_files import read_array, read_hdf5
-from ...learning.identification.search import Identification
-from ...learning.parameters import TILTS
-from ...pictures.seen import NEUTRAL
-from ...settings.run import RunSettings
-from ..identification_section import parameter_rows
-from ..page import Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text, Usage, write_page
-from ..ranking import LEAST_EVIDENCE
-from ..verdict import counted
-from ..wording import NONE, TONES, in_a_row, mm_text, number_text, share_text
+from ..io.arrays import FloatArray
+from ..io.errors import listed, number_of
+from ..io.safe_files import read_array, read_hdf5
+from ..learning.identification.search import Identification
+from ..learning.parameters import TILTS
+from ..report.identification_section import parameter_rows
+from ..report.page import Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text, Usage, write_page
+from ..report.ranking import LEAST_EVIDENCE
+from ..report.verdict import counted
+from ..report.wording import NONE, TONES, in_a_row, mm_text, number_text, share_text
+from ..settings.run import RunSettings
+from .seen import NEUTRAL
 
 _NAMES: Final = {"undeformed": "an undeformed body", "simulation": "the uncorrected simulator"}
 _MODELS: Final = {"undeformed": "Undeformed", "simulation": "Uncorrected", "sysid": "Identified"}

@@ -6,17 +6,17 @@ import shapely
 import torch
 from PIL import Image
 
-from ...data.camera import PlacedCamera, view_axes
-from ...data.markers import bind_markers
-from ...io.arrays import BoolArray, FloatArray
-from ...io.atomic import atomic_path
-from ...io.resuming import StageContext
-from ...io.safe_files import write_json
-from ...pictures.outlines import ClosedSurface
-from ...pictures.seen import Photo, SeenPose
-from ...settings.pictures import PictureData, PoseSettings, SimulatedCamera
-from ...settings.stage_keys import StageSettings
-from ..build import build_body, build_simulator
+from ..data.camera import PlacedCamera, view_axes
+from ..data.markers import bind_markers
+from ..experiment.build import build_body, build_simulator
+from ..io.arrays import BoolArray, FloatArray
+from ..io.atomic import atomic_path
+from ..io.resuming import StageContext
+from ..io.safe_files import write_json
+from ..settings.pictures import PictureData, PoseSettings, SimulatedCamera
+from ..settings.stage_keys import StageSettings
+from .outlines import ClosedSurface
+from .seen import Photo, SeenPose
 from .seen_poses import read_lenses, released_force, scene_file
 
 _BODY, _BEHIND = (46, 96, 140), (24, 24, 26)  # red, green and blue of the pictures

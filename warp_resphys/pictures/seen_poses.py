@@ -13,21 +13,25 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from ...core.fem.bodies import Body
-from ...core.mesh.readers import METRES, read_mesh
-from ...core.mesh.selection import vertices_at
-from ...core.mesh.volume_mesh import Mesh, quadratic
-from ...data.camera import Lens, PlacedCamera
-from ...data.markers import bind_markers
-from ...io.arrays import FloatArray, IntArray
-from ...io.atomic import atomic_path, digest
-from ...io.errors import DataFileError, InputError, listed, naming, number_of
-from ...io.resuming import StageContext
-from ...io.safe_files import atomic_hdf5, create, read_array, read_hdf5
-from ...pictures.clouds import Cloud
-from ...pictures.outlines import ClosedSurface, Outline
-from ...pictures.released_force import ReleasedForce
-from ...pictures.scene_files import (
+from ..core.fem.bodies import Body
+from ..core.mesh.readers import METRES, read_mesh
+from ..core.mesh.selection import vertices_at
+from ..core.mesh.volume_mesh import Mesh, quadratic
+from ..data.camera import Lens, PlacedCamera
+from ..data.markers import bind_markers
+from ..experiment.build import build_mesh, build_simulator
+from ..io.arrays import FloatArray, IntArray
+from ..io.atomic import atomic_path, digest
+from ..io.errors import DataFileError, InputError, listed, naming, number_of
+from ..io.resuming import StageContext
+from ..io.safe_files import atomic_hdf5, create, read_array, read_hdf5
+from ..settings.body import MaterialSettings
+from ..settings.pictures import PictureData, PoseSettings
+from ..settings.stage_keys import StageSettings
+from .clouds import Cloud
+from .outlines import ClosedSurface, Outline
+from .released_force import ReleasedForce
+from .scene_files import (
     Frame,
     SceneFile,
     check_times,
@@ -38,12 +42,8 @@ from ...pictures.scene_files import (
     read_scene,
     read_tracked,
 )
-from ...pictures.seen import Photo, SeenPose
-from ...pictures.tags import tag_poses
-from ...settings.body import MaterialSettings
-from ...settings.pictures import PictureData, PoseSettings
-from ...settings.stage_keys import StageSettings
-from ..build import build_mesh, build_simulator
+from .seen import Photo, SeenPose
+from .tags import tag_poses
 
 log = logging.getLogger(__name__)
 

@@ -16,38 +16,39 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from ...core.energies.catalogue import law_content
-from ...data.camera import CORRECTIONS, PlacedCamera
-from ...io.errors import InputError
-from ...io.parts import Checkpoint
-from ...io.progress import Progress, show
-from ...io.resuming import Stage, StageContext, package_versions, resources_used
-from ...io.safe_files import atomic_hdf5, create, read_json, write_json
-from ...learning.identification.search import (
+from ..core.energies.catalogue import law_content
+from ..data.camera import CORRECTIONS, PlacedCamera
+from ..experiment.build import build_mesh, simulation_device
+from ..experiment.digests import files_read
+from ..experiment.files import COMPARE, IDENTIFICATION, LAW_FILE, METRICS, REPORT
+from ..io.errors import InputError
+from ..io.parts import Checkpoint
+from ..io.progress import Progress, show
+from ..io.resuming import Stage, StageContext, package_versions, resources_used, run_stages
+from ..io.safe_files import atomic_hdf5, create, read_json, write_json
+from ..learning.identification.search import (
     Identification,
     first_points,
     refined_searches,
     search_parameters,
 )
-from ...learning.parameters import TILTS, configured_parameters, split_name, value_name
-from ...pictures.picture_misfit import PictureMisfit, values_of
-from ...pictures.released_force import OF_RELEASE
-from ...pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape, distance_of
-from ...report.identification_section import parameter_rows
-from ...report.pages.pictures_page import (
+from ..learning.parameters import TILTS, configured_parameters, split_name, value_name
+from ..report.identification_section import parameter_rows
+from ..settings.learning import Bounds
+from ..settings.pictures import PictureData
+from ..settings.run import RunSettings
+from ..settings.stage_keys import SIMULATOR, StageSettings
+from .camera_laboratory import frame_files, play_camera
+from .picture_misfit import PictureMisfit, values_of
+from .pictures_page import (
     PictureMetrics,
     PictureResult,
     distance_table,
     picture_verdict,
     write_pictures_report,
 )
-from ...settings.learning import Bounds
-from ...settings.pictures import PictureData
-from ...settings.run import RunSettings
-from ...settings.stage_keys import SIMULATOR, StageSettings
-from ..build import build_mesh, simulation_device
-from ..files import COMPARE, IDENTIFICATION, LAW_FILE, METRICS, REPORT
-from .camera_laboratory import frame_files, play_camera
+from .released_force import OF_RELEASE
+from .seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape, distance_of
 from .seen_poses import (
     PICTURES,
     SCENE,
@@ -496,6 +497,12 @@ def picture_metrics(folder: Path, run: RunSettings) -> PictureMetrics:
         "versions": package_versions(),
         "device": str(simulation_device(run.device)),
     }
+
+
+def run_pictures(run: RunSettings, folder: Path) -> None:
+    """Runs the stages of pictures, and prints the results."""
+    run_stages(picture_stages(run, files_read(run, run)), folder)
+    print_pictures(run, folder)
 
 
 def print_pictures(run: RunSettings, folder: Path) -> None:

@@ -1,1 +1,0 @@
-"""Identification of a material from pictures: the stages and a simulated camera."""

@@ -15,8 +15,8 @@ import warp_resphys
 from support.command_line import sentence
 from support.main_job import DRIVEN, IN_RUN, ROD, run, run_without_report
 from support.refusals import refuses
-from warp_resphys import Contact, HalfSpace, InputError, Twin, pipeline
-from warp_resphys.control import sampling
+from warp_resphys import Contact, HalfSpace, InputError, Twin
+from warp_resphys.control import control_stages, sampling
 from warp_resphys.control.control_files import (
     PLANNED,
     plans_file,

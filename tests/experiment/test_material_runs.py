@@ -195,7 +195,7 @@ def test_silicones_by_name():
 
 @pytest.mark.slow
 def test_simulated_tensile_test(tmp_path):
-    """The experiment as it is, with 1 % of noise, glued ends and a finer true mesh; on a machine that yields by 0.2 mm."""
+    """The experiment as it is: noise of 1 %, glued ends, a finer true mesh; the machine yields by 0.2 mm."""
     yielding = ("data.simulated.compliance=4.2e-5", "data.tests.tension.compliance=4e-5")
     assert outcome("experiment=material_test", f"hydra.run.dir={tmp_path}", *yielding).code == 0
     law = read_json(tmp_path / "law.json")

@@ -131,7 +131,7 @@ def test_membranes_that_cannot_be():
 
 @pytest.mark.slow
 def test_public_membranes(shared_data):
-    """A law from tension up to 400 %, scaled on the disc without rings, predicts one with rings at three loads."""
+    """A law from tension up to 400 %, scaled on a disc without rings, predicts one with rings at two loads."""
     folder = shared_data / "ecoflex_membranes"
     if not folder.is_dir():
         pytest.skip(f"there is no folder {folder} of public membranes")
@@ -143,14 +143,14 @@ def test_public_membranes(shared_data):
         np.array([np.sqrt(np.square(test.away(columns, {})).mean()) for test in held.values()])
         for columns in (law.columns, known["parameters"])
     )
-    assert len(sizes) == 3
+    assert len(sizes) == 2
     assert sizes.max() < 0.14
     assert np.square(unscaled).mean() > 4.0 * np.square(sizes).mean()
 
 
 def _tests_of(path):
     table, tests = read_membrane(path), {}
-    for force in np.unique(table.force):
+    for force in (table.force.min(), table.force.max()):
         rows = np.flatnonzero((table.force == force) & (table.height >= 0.010) & (table.height <= 0.055))[::2]
         membrane = Membrane(0.07, table.thickness, table.cap, force, table.rings)
         tests[force] = MaterialTest("bulge", table.height[rows] / 0.07, table.pressure[rows], specimen=membrane)

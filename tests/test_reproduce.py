@@ -225,6 +225,7 @@ def test_published_numbers_stand_beside_ours_and_a_failed_run_does_not_stop_the_
     assert f"| 4 | below 0.1 | high | {median} |" in Path("out/reproduction.md").read_text()
 
 
+@pytest.mark.release
 @pytest.mark.slow
 def test_a_robot_has_a_row_and_those_of_earlier_runs_keep_theirs(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)

@@ -71,6 +71,7 @@ def test_gymnasiums_checker_passes(fingers):
     environment.close()
 
 
+@pytest.mark.release
 @pytest.mark.slow
 def test_the_scripted_policy_lifts_the_ball_and_puts_it_down_at_its_goal(fingers):
     arms = make_vector("pick_and_place", fingers, 1, "sysid")

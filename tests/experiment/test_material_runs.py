@@ -244,18 +244,15 @@ def test_silicones_by_name():
 
 @pytest.mark.slow
 def test_simulated_tensile_test(tmp_path):
-    """The experiment as it is: 1 % of noise and glued ends, a finer true mesh.
-
-    And a machine that yields by 0.2 mm.
+    """The experiment as it is: noise of 1 %, glued ends, a finer true mesh; the machine yields by
+    0.2 mm.
     """
     yielding = ("data.simulated.compliance=4.2e-5", "data.tests.tension.compliance=4e-5")
-    for bound, change in ((0.01, ()), (0.02, yielding)):
-        folder = tmp_path / str(bound)
-        assert outcome("experiment=material_test", f"hydra.run.dir={folder}", *change).code == 0
-        law = read_json(folder / "law.json")
-        assert law["groups"] == []
-        assert law["parameters"]["c10"] == pytest.approx(30e3, rel=bound)
-        assert law["stretches"] == pytest.approx([1.6**-0.5, 1.6], rel=0.02)
+    assert outcome("experiment=material_test", f"hydra.run.dir={tmp_path}", *yielding).code == 0
+    law = read_json(tmp_path / "law.json")
+    assert law["groups"] == []
+    assert law["parameters"]["c10"] == pytest.approx(30e3, rel=0.02)
+    assert law["stretches"] == pytest.approx([1.6**-0.5, 1.6], rel=0.02)
 
 
 @pytest.mark.parametrize(

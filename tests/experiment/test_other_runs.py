@@ -483,6 +483,7 @@ def test_the_identified_material_on_other_bodies(folder, no_report):
     assert found["finer"]["moved_mm"] == pytest.approx(found["thin"]["moved_mm"], rel=0.3)
 
 
+@pytest.mark.release
 @pytest.mark.usefixtures("folder", "no_report")
 def test_the_force_of_a_finger_is_predicted_from_motions_in_free_air():
     """Blocked force: from SysID within 5 % of its mean (asked),

@@ -173,6 +173,7 @@ def test_membranes_that_cannot_be():
     refuses(InputError, "tests is empty", scale_to_tests, {}, KNOWN, density=1.0)
 
 
+@pytest.mark.release
 @pytest.mark.slow
 def test_public_membranes(shared_data):
     """A law from tension up to 400 %, scaled on the disc without rings,

@@ -18,6 +18,7 @@ SHORT = {
 }
 
 
+@pytest.mark.release
 def test_every_check_passes(device, folder):
     ended = outcome("check", f"device={device}")
     assert ended.code == 0, ended.out + ended.err

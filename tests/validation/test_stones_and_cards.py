@@ -104,6 +104,7 @@ def card_drop(scene, device):
     return float(z[0] - z[-1])
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(("share", "stands"), [(1.05, True), (0.95, False)])
 def test_an_arch(share, stands, device):
     """Of 25 stones: the speed of its keystone after half a second.

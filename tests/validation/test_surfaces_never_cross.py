@@ -310,7 +310,9 @@ def tentacle():
 CASES = {**erleben_cases(), **{"mat": mat(), "funnel": funnel(), "tentacle": tentacle()}}
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.release] * (name == "mat")) for name in CASES]
+)
 def test_surfaces_touch_and_cross_without_contact_alone(name, device):
     case = CASES[name]
     crossings, gap, end = run(case, device)

@@ -213,7 +213,8 @@ def test_outputs_come_last_and_end_in_out(name):
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="Warp compiles for CUDA on Linux")
 def test_every_module_compiles_for_a_gpu(tmp_path):
-    """Without one; lanes are those of a CPU."""
-    for module in {kernel.module for (file, _), kernel in kernels().items() if file != "lanes.py"}:
+    """Without one, a module of each file; lanes are those of a CPU."""
+    modules = {file: kernel.module for (file, _), kernel in kernels().items() if file != "lanes.py"}
+    for module in {*modules.values()}:
         wp.compile_aot_module(module, arch=80, module_dir=tmp_path)
-    assert len(list(tmp_path.glob("*.cubin")) + list(tmp_path.glob("*.ptx"))) > 20
+    assert len(list(tmp_path.glob("*.cubin")) + list(tmp_path.glob("*.ptx"))) >= len(modules) > 15

@@ -11,11 +11,11 @@ each segment adds the friction of `bristle`, which depends on the length of the 
 import warp as wp
 
 from .axial import thread_pull
+from .constants import ONE, ZERO
 from .points import MatrixPoints, matrix_at
 
 wp.set_module_options({"enable_backward": False})
 
-ZERO, ONE = wp.float64(0.0), wp.float64(1.0)
 OFFSET_UNIT = (
     5e-3  # unit of the offsets [m], about a cell size, so that the columns of F have similar norms
 )
@@ -50,9 +50,11 @@ def bristle(
     """Returns energy, force and slope of a guide's friction after a slide
     (``energies.tendon_forces``).
     """
-    size, start, most, sign = slide, hold, rise, ONE
+    size, start = slide, hold
+    most, sign = rise, ONE
     if slide < ZERO:
-        size, start, most, sign = -slide, -hold, drop, -ONE
+        size, start = -slide, -hold
+        most, sign = drop, -ONE
     left = (start - most) * wp.exp(-size / length)
     return (
         most * size + length * (start - most - left),

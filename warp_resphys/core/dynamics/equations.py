@@ -82,7 +82,9 @@ class EquationsOfMotion:
             raise InputError(
                 f"gravity is {gravity}: it must be three finite accelerations, in m/s^2."
             )
-        self.body, self.time_step, self.settings = body, time_step, settings
+        self.body = body
+        self.time_step = time_step
+        self.settings = settings
         self.method = make_integrator(integrator)
         self.rest_positions = torch.as_tensor(body.vertices, device=device, dtype=dtype)
         self.fixed = torch.as_tensor(body.fixed_vertices, device=device)

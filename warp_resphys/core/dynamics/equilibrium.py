@@ -227,7 +227,8 @@ def reaction_of(
         gradient: (B, D + R, 3) of the energies at the held vertices, from `equilibrium` [N].
         loads: (B, N, 3) further loads on the held vertices, from `EnergySet.loads_at_fixed` [N].
     """
-    if not len(held := workspace.held):
+    held = workspace.held
+    if not len(held):
         return None
     force = terms.force if loads is None else terms.force + loads
     values = (terms.values[energy][name] for energy, name in workspace.potential.value_names)
@@ -254,7 +255,8 @@ def _exerted(workspace: Workspace, forces: torch.Tensor) -> torch.Tensor:
     """Returns what clamps and planes can exert of forces (B, D + R, 3):
     at vertices in planes the normal part.
     """
-    if not (coordinates := workspace.potential.coordinates).slides:
+    coordinates = workspace.potential.coordinates
+    if not coordinates.slides:
         return forces
     count = len(workspace.fixed)
     return torch.cat([forces[:, :count], coordinates.normal(forces[:, count:])], 1)
@@ -453,7 +455,8 @@ def _adjoint_solution(
 
     for hessian in hessians:
         hessian.refactor_exact()
-        z, rest, before = torch.zeros_like(right), right, size
+        z = torch.zeros_like(right)
+        rest, before = right, size
         for _ in range(1 if hessian.exact else 1 + _REFINEMENTS):
             z = z + solved(hessian, rest)
             product = potential.stiffness_product(z)

@@ -173,7 +173,8 @@ class BaseFrame:
     """
 
     def __init__(self, poses: torch.Tensor, time_step: float, first: int = 0) -> None:
-        self._poses, self._step, self._first = poses, time_step, first
+        self._poses = poses
+        self._step, self._first = time_step, first
         self._rotation = rotations(poses[..., 3:])
 
     def _at(self, step: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -152,7 +152,9 @@ class _Problem:
     def __init__(
         self, simulator: Simulator, pose_name: str, steps: int, batch: int, seed: int, change: float
     ) -> None:
-        self.simulator, self.steps, self.batch, self.change = simulator, steps, batch, change
+        self.simulator = simulator
+        self.steps, self.batch = steps, batch
+        self.change = change
         self.random = torch.Generator().manual_seed(seed)
         self.state = pose(simulator, pose_name, batch)
         n = simulator.body.n_vertices

@@ -123,16 +123,10 @@ class Simulator:
             self.dtype,
         )
         self._equations = equations = EquationsOfMotion(self.body, self.material, *where)
-        self.method, self.rest_positions, self.fixed = (
-            equations.method,
-            equations.rest_positions,
-            equations.fixed,
-        )
-        self.parameters, self.defaults, self.counts = (
-            equations.parameters,
-            equations.defaults,
-            equations.counts,
-        )
+        self.method = equations.method
+        self.rest_positions, self.fixed = equations.rest_positions, equations.fixed
+        self.parameters, self.defaults = equations.parameters, equations.defaults
+        self.counts = equations.counts
         self.energies = equations.energies
         self.inputs, self.parts = self.energies.inputs, self.energies.parts
         self._check_cells = CellCheck(self.body, self.energies.placed)

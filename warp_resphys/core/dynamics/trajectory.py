@@ -264,9 +264,9 @@ class Motion:
             InputError: an unknown environment or another extension.
             DataFileError: the files cannot be written.
         """
-        q, v, markers = (
-            self.of_environment(values, environment) for values in (self.q, self.v, self.labelled)
-        )
+        q = self.of_environment(self.q, environment)
+        v = self.of_environment(self.v, environment)
+        markers = self.of_environment(self.labelled, environment)
         fields = dict[str, FloatArray]()
         if self.reaction is not None:
             held = self.reaction.vertices.cpu()

@@ -163,7 +163,8 @@ def read_law(name: str) -> LawContent:
                 f"{path}: parameters.{key} is {value!r}: a law has a finite number there; "
                 "identify it again."
             )
-        if (unit := units.get(key, unit_of(key))) != unit_of(key):
+        unit = units.get(key, unit_of(key))
+        if unit != unit_of(key):
             raise DataFileError(
                 f"{path}: units.{key} is {unit!r}: a law has {unit_of(key)!r} there."
             )

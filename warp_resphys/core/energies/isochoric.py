@@ -43,7 +43,8 @@ class DeformationPath(NamedTuple):
 
 def path_of(kind: str, strain: FloatArray) -> DeformationPath:
     """Returns the path of a kind of test at strains (N,)."""
-    x, one, zero = strain, np.ones_like(strain), np.zeros_like(strain)
+    x = strain
+    one, zero = np.ones_like(x), np.zeros_like(x)
     if kind == "shear":
         root = np.sqrt(1.0 + 0.25 * x**2)
         first = 0.5 * x + root
@@ -120,7 +121,8 @@ def bulk_of(parameters: Mapping[str, float], poissons_ratio: float) -> float:
 
 def _elastic(term: str, path: DeformationPath) -> FloatArray:
     s, slope = path.stretches, path.stretch_slopes
-    if ogden := re.fullmatch(r"ogden_(m?)(\d+)", term):
+    ogden = re.fullmatch(r"ogden_(m?)(\d+)", term)
+    if ogden:
         n = int(ogden[2]) * (-1 if ogden[1] else 1)
         return np.asarray((2.0 / n * s ** (n - 1) * slope).sum(1))
     power = int(term[1]) + int(term[2])  # of a (c10, c20, c30) or b (c01, c02)

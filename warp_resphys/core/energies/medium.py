@@ -106,7 +106,8 @@ class BoundMedium(BoundEnergy):
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         """Returns values with the areas and normals of the start of the step."""
-        h, batch, stage = step.stage.step, step.state.batch, step.stage
+        stage = step.stage
+        h, batch = stage.step, step.state.batch
         tangents = torch.einsum("qkd,bfki->bfqdi", self._slopes, step.state.q[:, self._nodes])
         area = torch.linalg.cross(tangents[..., 0, :], tangents[..., 1, :]) * self._weights[:, None]
         names = ("medium_density", "drag_linear", "drag_normal", "drag_tangential", "added_layer")

@@ -31,7 +31,8 @@ from .launcher import Launcher
 from .term import LawTerm, PartPoints, PointSet
 
 STRESS = Quantity(
-    *("muscle_stress", "Pa"),
+    "muscle_stress",
+    "Pa",
     per="muscle",
     typical=1e4,
     words="stress",
@@ -39,7 +40,8 @@ STRESS = Quantity(
     shown_factor=1e-3,
 )
 CONTRACTION = Quantity(
-    *("muscle_contraction", ""),
+    "muscle_contraction",
+    "",
     per="muscle",
     typical=0.05,
     words="contraction",
@@ -143,7 +145,8 @@ class Muscles(Energy):
             InputError: a cell that the mesh does not have.
         """
         points, weights = mesh.element.rule
-        nodes, operators, volumes, numbers = [], [], [], []
+        nodes, operators = [], []
+        volumes, numbers = [], []
         for number, (name, muscle) in enumerate(zip(self.names, self.muscles, strict=True)):
             cells = np.asarray(muscle.cells, dtype=np.int64)
             wrong = cells[(cells < 0) | (cells >= len(mesh.cells))]

@@ -34,7 +34,8 @@ from .launcher import Launcher
 from .term import LawTerm, PartPoints, PointSet, Values, value_of
 
 PRESSURE = Quantity(
-    *("pressure", "Pa"),
+    "pressure",
+    "Pa",
     per="chamber",
     typical=1e4,
     words="pressure",
@@ -188,7 +189,8 @@ class BoundPressure(BoundEnergy):
         if not len(self._nodes):
             return None
         f = torch.einsum("cqkw,bcki->bcqiw", self._operators, q[:, self._nodes].double())
-        x, t1, t2 = f[..., 0] - self._apex[self._part], f[..., 1], f[..., 2]
+        x = f[..., 0] - self._apex[self._part]
+        t1, t2 = f[..., 1], f[..., 2]
         columns = (
             2.0 * torch.linalg.cross(t1, t2),
             torch.linalg.cross(x, t2),
@@ -214,7 +216,8 @@ def _apex(chamber: Chamber, body: Body) -> FloatArray:
     Raises:
         MeshError: see `check_open_faces`; or two of the planes are parallel.
     """
-    if not len(edges := chamber.edges):
+    edges = chamber.edges
+    if not len(edges):
         return np.zeros(3)
     sliding = [plane.contains(body.vertices[edges]).all(axis=1) for plane in body.symmetry]
     fixed = np.isin(edges, body.fixed_vertices).all(axis=1)

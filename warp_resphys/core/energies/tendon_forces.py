@@ -49,7 +49,8 @@ TENSION = Quantity(
     "tendon_tension", "N", 0.0, closed=True, per="tendon", words="tension", shown_unit="N"
 )
 CONTRACTION = Quantity(
-    *("tendon_contraction", "m"),
+    "tendon_contraction",
+    "m",
     per="tendon",
     typical=1e-3,
     words="contraction",
@@ -199,7 +200,8 @@ class BoundTendons(BoundEnergy):
         super().__init__(tendons, site)
         (points,) = site.points
         assert isinstance(points, TendonPoints)
-        part, device, count = points.part, site.rest_positions.device, tendons.count
+        part, count = points.part, tendons.count
+        device = site.rest_positions.device
         self._lines = TendonLines(points, count, toe, site.rest_positions)
         first = np.searchsorted(part, np.arange(count + 1))
         self._runs = Launcher(1, device).upload(first.astype(np.int32), int)

@@ -222,7 +222,9 @@ class Tendons(Energy):
         Raises:
             InputError: a guide outside of the body.
         """
-        nodes, operators, tendon, rest, anchors = [], [], [], [], []
+        nodes, operators = [], []
+        tendon = []
+        rest, anchors = [], []
         for number, (route, in_world, directions) in enumerate(self._lines):
             # Those in the world have no place.
             places = locate(mesh, np.where(in_world[:, None], route[~in_world][:1], route))

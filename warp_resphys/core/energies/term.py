@@ -68,12 +68,8 @@ class PointSet:
     def __init__(
         self, launcher: Launcher, points: Points, n_vertices: int, in_body: slice, in_energy: slice
     ) -> None:
-        self.source, self.in_body, self.in_energy, self.n_points = (
-            points,
-            in_body,
-            in_energy,
-            points.n_points,
-        )
+        self.source, self.n_points = points, points.n_points
+        self.in_body, self.in_energy = in_body, in_energy
         self.n_vertices, self.device = n_vertices, launcher.device
         self.cells, self.points_per_cell, self.nodes_per_cell, self.width = points.gradients.shape
         vertex = points.nodes.ravel()
@@ -187,7 +183,8 @@ class Term(ABC):
             positions: (B, N, 3) buffer of x [m].
             direction: (B, N, 3) buffer of z [m].
         """
-        batch, outputs, commands = self.launcher, self._slopes(), []
+        batch, outputs = self.launcher, self._slopes()
+        commands = []
         out = {o.name: batch.zeros(*o.shape) for o in outputs}
         x, z = (warp_view(field, wp.vec3d) for field in (positions, direction))
         for s in self.sets:
@@ -362,7 +359,8 @@ class LawTerm(PartTerm):
         stiffness: Callable[[Mapping[str, torch.Tensor]], torch.Tensor] | None = None,
     ) -> None:
         super().__init__(launcher, sets, shapes, count)
-        self._kernels, self._law, self._shapes = point_kernels(law), law, dict(shapes)
+        self._kernels, self._law = point_kernels(law), law
+        self._shapes = dict(shapes)
         self._arrays, self._stiffness = frozenset(arrays), stiffness
         self._constants = launcher.zeros(len(constants)) + torch.tensor(
             constants, device=launcher.device, dtype=torch.float64

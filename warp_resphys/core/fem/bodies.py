@@ -336,7 +336,8 @@ class Body:
         if part not in named:
             known = f"choose one of {', '.join(named)}" if named else "its mesh has no regions"
             raise InputError(f"the body has no region {part!r}: {known}.")
-        if not len(found := np.intersect1d(self.fixed_vertices, named[part])):
+        found = np.intersect1d(self.fixed_vertices, named[part])
+        if not len(found):
             raise InputError(f"no vertex of {part!r} is fixed: fix some, or choose another region.")
         return found
 
@@ -411,9 +412,10 @@ class Body:
                     f"{n_fixed} of the {len(vertices)} vertices of the rigid part {name!r} are "
                     "fixed: fix all of them, or none."
                 )
-            if other := next(
+            other = next(
                 (part_of_vertex[i] for i in vertices.tolist() if i in part_of_vertex), None
-            ):
+            )
+            if other:
                 raise InputError(
                     f"the rigid parts {other!r} and {name!r} share vertices: make them one region."
                 )

@@ -347,7 +347,8 @@ def control_vertices(
             planes.
     """
     places = vertices[candidates]
-    inside = [flags for plane in planes if (flags := plane.contains(places)).any()]
+    each = [plane.contains(places) for plane in planes]
+    inside = [flags for flags in each if flags.any()]
     size = float(np.linalg.norm(np.ptp(places, axis=0)))
     chosen: list[int] = []
     for allowed in _corner_sets(inside, len(candidates)):

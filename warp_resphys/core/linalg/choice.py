@@ -97,7 +97,8 @@ def _cheapest(
         return DenseSolver if unknowns <= MAX_DENSE_UNKNOWNS else SparseSolver
     kind: type[LinearSolver] = BandedSolver
     cost = unknowns * width**2
-    if len(border := hubs(rows, cols, n_nodes)):
+    border = hubs(rows, cols, n_nodes)
+    if len(border):
         rest = block * bandwidth(
             *banded_rest(rows, cols, n_nodes, border)[:2], n_nodes - len(border)
         )

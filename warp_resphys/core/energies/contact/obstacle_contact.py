@@ -233,7 +233,8 @@ class BoundContact(BoundEnergy):
         for name in site.body.controls:
             cells = site.body.mesh.cells[site.body.mesh.region(name)]
             part = torch.as_tensor(np.unique(cells) + site.first, device=like.device)
-            if len(surface := torch.isin(self._vertices, part).nonzero().ravel()):
+            surface = torch.isin(self._vertices, part).nonzero().ravel()
+            if len(surface):
                 # Others are out of reach.
                 rigid.append((surface, part[~torch.isin(part, self._vertices)]))
         self._clearance = Clearance(

@@ -89,7 +89,9 @@ class ContactTerm(Term):
 
     @override
     def adjoint(self, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
-        batch, (s,), size = self.launcher, self.sets, (self.n_points, self._count)
+        batch = self.launcher
+        (s,) = self.sets
+        size = (self.n_points, self._count)
         names = (
             "place",
             "turn",

@@ -178,7 +178,8 @@ class SurfaceTerm(Term):
         commands.append(
             launcher.record(kernels.gather, size, [*incidence, *pair_out, self.n_points, 0], sums)
         )
-        if (grips := self._grips) is not None:
+        grips = self._grips
+        if grips is not None:
             inputs = [active, grips.struct, *self._friction(), positions]
             commands.append(
                 launcher.record(kernels.grip_forces, (grips.count,), inputs, grips.outputs)
@@ -214,7 +215,8 @@ class SurfaceTerm(Term):
     def pair_tangents(
         self, positions: Any, clamp: bool, active: torch.Tensor
     ) -> PairTangents | None:
-        launcher, chosen, parts = self.launcher, self._chosen(active), list[PairTangents]()
+        launcher, chosen = self.launcher, self._chosen(active)
+        parts = list[PairTangents]()
         if self._whole is not None:
             positions = warp_view(self._expand(wp.to_torch(positions), self._whole), wp.vec3d)
         if len(chosen):
@@ -233,7 +235,8 @@ class SurfaceTerm(Term):
             parts.append(
                 PairTangents(self._list.environment[chosen], self._list.nodes[chosen], blocks)
             )
-        if (grips := self._grips) is not None:
+        grips = self._grips
+        if grips is not None:
             blocks = self._force.new_zeros(grips.count, 12, 12)
             inputs = [grips.struct, *self._friction(), positions]
             launcher.run(
@@ -258,7 +261,8 @@ class SurfaceTerm(Term):
         """Returns the launch that bounds a way, after a search for pairs along it,
         and limits its length.
         """
-        launcher, pairs, self._bounded = self.launcher, self._list, True
+        launcher, pairs = self.launcher, self._list
+        self._bounded = True
         start = self._expand(wp.to_torch(origin))
         end = self._expand(wp.to_torch(positions))
         part = wp.to_torch(share)
@@ -330,7 +334,8 @@ class SurfaceTerm(Term):
         gap = torch.full_like(x[..., 0], self._reach)
         slide = torch.full_like(gap, -1.0)
         start, stiffness = value_of(values, "surface_start"), value_of(values, STIFFNESS.name)
-        if (slides := self.sliding(start, stiffness)) is not None:
+        slides = self.sliding(start, stiffness)
+        if slides is not None:
             names = ("surface_reference", FRICTION.name, "surface_slip")
             force = slides.force(x, *(value_of(values, name) for name in names))
             ways = (
@@ -345,7 +350,8 @@ class SurfaceTerm(Term):
             friction = friction.index_put(
                 place, slides.weights[..., None] * force[:, None], accumulate=True
             )
-        if len(chosen := self._near_at(x.detach())):
+        chosen = self._near_at(x.detach())
+        if len(chosen):
             differentiable = torch.is_grad_enabled()
             with torch.enable_grad():
                 leaf = x if x.requires_grad else x.detach().requires_grad_()
@@ -384,7 +390,8 @@ class SurfaceTerm(Term):
             ]
             slopes = tuple(torch.zeros_like(value) for value in leaves)
             with torch.enable_grad():
-                if (slides := self.sliding(start, stiffness)) is not None:
+                slides = self.sliding(start, stiffness)
+                if slides is not None:
                     force = slides.force(x, reference, friction, self.values["surface_slip"])
                     along = ways[slides.environment[:, None], slides.nodes]
                     work = (slides.weights[..., None] * along * force[:, None]).sum()

@@ -137,7 +137,8 @@ def viscous_slopes(
 def viscosity_of(law: Law) -> SimpleNamespace:
     """Returns the struct of a material's values, and the viscosity at its points."""
     module, vector = named_module(law.name), law.values
-    mu_of, lambda_of = (vector(*(wp.float64(pair[i]) for pair in law.lame)) for i in (0, 1))
+    mu_of = vector(*(wp.float64(mu) for mu, _ in law.lame))
+    lambda_of = vector(*(wp.float64(lame_lambda) for _, lame_lambda in law.lame))
 
     @wp.struct
     class Values:

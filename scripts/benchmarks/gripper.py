@@ -30,15 +30,13 @@ from warp_resphys.experiment.build import choose_device
 
 from .measuring import free_unknowns, now, solves, take_turns
 
-LENGTH: Final = 0.08  # [m]
-SIDE: Final = 0.014  # [m]
-RADIUS: Final = 0.012  # [m]
-TABLE: Final = -0.083  # [m]
-GAP: Final = 1.5e-3  # [m]
+LENGTH, SIDE = 0.08, 0.014  # of a finger [m]
+RADIUS: Final = 0.012  # of the ball [m]
+TABLE: Final = -0.083  # height of the table [m]
+GAP: Final = 1.5e-3  # between a finger and the ball [m]
 D: Final = 5e-4  # distance at which contact begins [m]
 STIFFNESS: Final = 5e4  # [Pa]
-FRICTION: Final = 0.5
-SLIP_SPEED: Final = 5e-3  # [m/s]
+FRICTION, SLIP_SPEED = 0.5, 5e-3  # 1, [m/s]
 CLOSED, LIFTED = 0.2, 0.5  # times of a grasp [s]
 RISE: Final = 0.03  # [m]
 TIME_STEP: Final = 0.01  # [s]

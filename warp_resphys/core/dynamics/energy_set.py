@@ -158,8 +158,8 @@ class EnergySet:
         values: list[Values] = [
             bound.prepare(mine) for bound, mine in zip(self._bound, split, strict=True)
         ]
-        each = [bound.mass(mine) for bound, mine in zip(self._bound, split, strict=True)]
-        masses = [mass for mass in each if mass]
+        by_energy = [bound.mass(mine) for bound, mine in zip(self._bound, split, strict=True)]
+        masses = [mass for mass in by_energy if mass]
         return values, masses[0] if len(masses) == 1 else Mass.sum(masses)
 
     def _values(

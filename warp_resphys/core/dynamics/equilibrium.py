@@ -373,9 +373,10 @@ def _minimise(
         start = start.clone()
         start[:, fixed] = fixed_positions
     report = minimiser.solve(potential.improved_start(start).to(start), None if parts else follows)
+    solves = [*parts, report]
     work = {
-        name: sum(getattr(part, name) for part in [*parts, report])
-        for name in ("iterations", "factorisations")
+        "iterations": sum(part.iterations for part in solves),
+        "factorisations": sum(part.factorisations for part in solves),
     }
     gradient = potential.held_gradient[:, workspace.held]
     return potential.positions.to(start.dtype, copy=True), replace(report, **work), gradient

@@ -168,8 +168,10 @@ class _Problem:
                 for name, quantity in simulator.inputs.items()
             },
         )
-        h = simulator.time_step
-        self.weights = self.noise(steps + 1, batch, n, 3), h * self.noise(steps + 1, batch, n, 3)
+        self.weights = (
+            self.noise(steps + 1, batch, n, 3),
+            simulator.time_step * self.noise(steps + 1, batch, n, 3),
+        )
 
     def noise(self, *shape: int) -> torch.Tensor:
         return self.simulator.tensor(

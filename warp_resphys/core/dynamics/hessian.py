@@ -230,8 +230,7 @@ class ProjectiveHessian(HessianApproximation):
 
     @override
     def ready(self) -> bool:
-        terms = self._terms()
-        return self._key is not None and all(map(torch.equal, self._key, terms))
+        return self._key is not None and all(map(torch.equal, self._key, self._terms()))
 
     @override
     def refactor(

@@ -114,15 +114,15 @@ class Simulator:
             else {"relative_tolerance": self.relative_tolerance}
         )
         self.settings = parse(SolverSettings, chosen, "solver").changed(**own)
-        where = (
+        self._equations = equations = EquationsOfMotion(
+            self.body,
+            self.material,
             self.gravity,
             self.time_step,
             self.integrator,
             self.settings,
-            self.device,
-            self.dtype,
+            {"device": self.device, "dtype": self.dtype},
         )
-        self._equations = equations = EquationsOfMotion(self.body, self.material, *where)
         self.method = equations.method
         self.rest_positions, self.fixed = equations.rest_positions, equations.fixed
         self.parameters, self.defaults = equations.parameters, equations.defaults

@@ -119,9 +119,8 @@ class Motion:
         wanted = torch.as_tensor(times).to(self.markers)
         if len(self.q) == 1:
             return self.markers.expand(len(wanted), -1, -1, -1)
-        batch = self.q.shape[1]
         return sample(
-            self.markers.transpose(0, 1), wanted.expand(batch, -1), self.time_step
+            self.markers.transpose(0, 1), wanted.expand(self.q.shape[1], -1), self.time_step
         ).transpose(0, 1)
 
     def surface(self, environment: int = 0) -> ObstacleSurface:

@@ -189,8 +189,7 @@ def read_law(name: str) -> LawContent:
 
 def unit_of(name: str) -> str:
     """Unit of a parameter of a law."""
-    words = {*name.split("_")}
-    return next((unit for word, unit in _UNITS.items() if word in words), "Pa")
+    return next((unit for word, unit in _UNITS.items() if word in name.split("_")), "Pa")
 
 
 def share_outside_law(name: str, mesh: Mesh, positions: NDArray[np.float64]) -> float:

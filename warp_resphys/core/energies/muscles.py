@@ -191,6 +191,5 @@ class Muscles(Energy):
         def stiffness(values: Mapping[str, torch.Tensor]) -> torch.Tensor:
             return values["muscle_stress"].clamp_min(0.0) + values["muscle_stiffness"]
 
-        return LawTerm(
-            launcher, sets, MUSCLE, shapes, self.count, constants=[self.toe], stiffness=stiffness
-        )
+        law = PointLaw(MUSCLE, [self.toe], stiffness)
+        return LawTerm(launcher, sets, law, shapes, self.count)

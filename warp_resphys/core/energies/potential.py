@@ -239,8 +239,8 @@ class IncrementalPotential(Launcher):
             self._feasible[0][0][:, moved] = positions[:, moved]
         for term in self.energies:
             term.set_step()
-        each = [term.total_stiffness() for term in self.energies]
-        totals = [total for total in each if total is not None]
+        stiffnesses = [term.total_stiffness() for term in self.energies]
+        totals = [stiffness for stiffness in stiffnesses if stiffness is not None]
         if totals:
             self.stiffness.copy_(totals[0] if len(totals) == 1 else torch.stack(totals).sum(0))
 

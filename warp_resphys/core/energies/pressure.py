@@ -31,7 +31,7 @@ from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Quantity
 from .base import BoundEnergy, Energy, EnergySite
 from .launcher import Launcher
-from .term import LawTerm, PartPoints, PointSet, Values, value_of
+from .term import LawTerm, PartPoints, PointLaw, PointSet, Values, value_of
 
 PRESSURE = Quantity(
     "pressure",
@@ -132,7 +132,7 @@ class Pressure(Energy):
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> LawTerm:
         shapes = {"pressure": (self.count,), "apex": (self.count, 3)}
-        return LawTerm(launcher, sets, PRESSURE_LAW, shapes, self.count)
+        return LawTerm(launcher, sets, PointLaw(PRESSURE_LAW), shapes, self.count)
 
 
 class BoundPressure(BoundEnergy):
@@ -164,14 +164,9 @@ class BoundPressure(BoundEnergy):
                 points.weights.reshape(shape)[touching],
             )
         )
-        self._nodes, self._part, self._at_edge = (
-            torch.as_tensor(values, device=device)
-            for values in (
-                points.nodes[touching],
-                points.part.reshape(shape)[touching],
-                at_edge[touching],
-            )
-        )
+        self._nodes = torch.as_tensor(points.nodes[touching], device=device)
+        self._part = torch.as_tensor(points.part.reshape(shape)[touching], device=device)
+        self._at_edge = torch.as_tensor(at_edge[touching], device=device)
 
     @override
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:

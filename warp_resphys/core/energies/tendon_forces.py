@@ -437,7 +437,7 @@ class TendonTerm(PartTerm):
         columns = self.values[ROUTE].square().sum(-1)
         stretching = (tension * columns)[:, self.part_of] / self._segment_length
         if self._rubs:  # A guide's slope is at most the sum of its bounds over the bristle length.
-            _, drop, rise, _ = (self.values[name] for name in STEP_VALUES)
+            drop, rise = self.values["tendon_drop"], self.values["tendon_rise"]
             beyond = self._lines.beyond
             slopes = (drop + rise) / self.values[BRISTLE.name][:, self.part_of] * beyond.sum(0)
             stretching = stretching + columns[:, self.part_of] * (slopes @ beyond.mT)

@@ -330,38 +330,48 @@ class PartTerm(Term):
         return torch.eye(self.count, device=self.launcher.device, dtype=torch.float64)[self.part_of]
 
 
-class LawTerm(PartTerm):
-    """A term whose points follow a law of any number of values (``kernels.laws``).
+class PointLaw(NamedTuple):
+    """A law of points with what does not change.
 
-    Args:
-        launcher: launcher of the potential.
-        sets: one set of points.
+    Attributes:
         law: energy of a point as a function of the values.
-        shapes: shapes of the values in the order of the vector: (count,) or (count, n) for one or n
-            values per part.
-        count: number of parts.
-        arrays: names of arrays, of any shape, that every point reads completely.
         constants: numbers that are the last values at every point.
         stiffness: returns an upper bound (B, count) of the eigenvalues of a point of weight one
             from the values; zero if omitted: the constant matrix of projective dynamics does not
             contain the energy.
     """
 
+    law: Law
+    constants: Sequence[float] = ()
+    stiffness: Callable[[Mapping[str, torch.Tensor]], torch.Tensor] | None = None
+
+
+class LawTerm(PartTerm):
+    """A term whose points follow a law of any number of values (``kernels.laws``).
+
+    Args:
+        launcher: launcher of the potential.
+        sets: one set of points.
+        point_law: law of the points.
+        shapes: shapes of the values in the order of the vector: (count,) or (count, n) for one or n
+            values per part.
+        count: number of parts.
+        arrays: names of arrays, of any shape, that every point reads completely.
+    """
+
     def __init__(
         self,
         launcher: Launcher,
         sets: Sequence[PointSet],
-        law: Law,
+        point_law: PointLaw,
         shapes: Shapes,
         count: int,
         arrays: Sequence[str] = (),
-        constants: Sequence[float] = (),
-        stiffness: Callable[[Mapping[str, torch.Tensor]], torch.Tensor] | None = None,
     ) -> None:
         super().__init__(launcher, sets, shapes, count)
-        self._kernels, self._law = point_kernels(law), law
-        self._shapes = dict(shapes)
-        self._arrays, self._stiffness = frozenset(arrays), stiffness
+        self._law, constants = point_law.law, point_law.constants
+        self._stiffness, self._kernels = point_law.stiffness, point_kernels(self._law)
+        self._shapes, self._arrays = dict(shapes), frozenset(arrays)
         self._constants = launcher.zeros(len(constants)) + torch.tensor(
             constants, device=launcher.device, dtype=torch.float64
         )

@@ -344,9 +344,8 @@ class Section:
                 strips.append(sorted({*sides, *(edge for strip in joined for edge in strip)}))
         numbers = {}
         for strip in strips:
-            pieces = [
-                self.piece(*edge) for edge in [edge for edge in strip if edge in solid] or strip
-            ]
+            solid_edges = [edge for edge in strip if edge in solid]
+            pieces = [self.piece(*edge) for edge in solid_edges or strip]
             least = ceil(max(abs(piece.turn) for piece in pieces) / _LARGEST_TURN)
             length = float(np.mean([abs(piece.end - piece.start) for piece in pieces]))
             numbers.update(dict.fromkeys(strip, max(1, least, round(length / size))))
@@ -395,9 +394,7 @@ class Section:
             area += piece.area
             start.append(piece.points(t))
             move.append(piece.moves(t, self.motion(first), self.motion(last)))
-        p, w = (
-            np.concatenate([parts[0][:1], *(part[1:] for part in parts)]) for parts in (start, move)
-        )
+        p, w = _chained(start), _chained(move)
         a0, a2 = _fan(p, p), _fan(w, w)
         a1 = _fan(p, w) + _fan(w, p)
         lack = area - a0
@@ -477,6 +474,11 @@ class Section:
                     ],
                     SOLID,
                 )
+
+
+def _chained(parts: Sequence[ComplexArray]) -> ComplexArray:
+    """Returns the points of successive sides, without the first of every later side."""
+    return np.concatenate([parts[0][:1], *(part[1:] for part in parts)])
 
 
 def _fan(a: ComplexArray, b: ComplexArray) -> float:

@@ -374,8 +374,7 @@ class BoundContact(BoundEnergy):
         """Returns the poses at the start of a step and one step before."""
         if not self._contact.moves:
             return now, now
-        memory = step.state.memory
-        poses = [memory.get(name) for name in (m.name for m in self.memory)]
+        poses = [step.state.memory.get(m.name) for m in self.memory]
         if poses[0] is None or poses[1] is None:
             rest = (
                 now

@@ -161,8 +161,13 @@ class SurfaceTerm(Term):
         launcher, pairs = self.launcher, self._list
         if self._sized != pairs.version:
             self._size(pairs.count)
-        stiffness = self.view(STIFFNESS.name)
-        inputs = [active, pairs.pairs, stiffness, wp.float64(self._reach), positions]
+        inputs = [
+            active,
+            pairs.pairs,
+            self.view(STIFFNESS.name),
+            wp.float64(self._reach),
+            positions,
+        ]
         pair_out = [
             warp_view(self._pair_force, nearest_points.Corners),
             warp_view(self._pair_energy, wp.float64),
@@ -221,11 +226,10 @@ class SurfaceTerm(Term):
             positions = warp_view(self._expand(wp.to_torch(positions), self._whole), wp.vec3d)
         if len(chosen):
             indices, blocks = chosen.to(torch.int32), self._force.new_zeros(len(chosen), 12, 12)
-            stiffness = self.view(STIFFNESS.name)
             inputs = [
                 warp_view(indices, wp.int32),
                 self._list.pairs,
-                stiffness,
+                self.view(STIFFNESS.name),
                 wp.float64(self._reach),
                 positions,
             ]
@@ -246,8 +250,11 @@ class SurfaceTerm(Term):
             parts.append(PairTangents(grips.environment[used], grips.nodes[used], blocks[used]))
         if not parts:
             return None
-        names = ("environment", "nodes", "blocks")
-        return PairTangents(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+        return PairTangents(
+            torch.cat([part.environment for part in parts]),
+            torch.cat([part.nodes for part in parts]),
+            torch.cat([part.blocks for part in parts]),
+        )
 
     @override
     def feasible(self) -> tuple[torch.Tensor, torch.Tensor]:

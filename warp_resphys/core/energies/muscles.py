@@ -28,7 +28,7 @@ from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity, parameter
 from .base import Energy
 from .launcher import Launcher
-from .term import LawTerm, PartPoints, PointSet
+from .term import LawTerm, PartPoints, PointLaw, PointSet
 
 STRESS = Quantity(
     "muscle_stress",

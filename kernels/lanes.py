@@ -33,9 +33,8 @@ from .modules import generated, named_module
 from .points import MatrixPoints, matrix_at
 
 WIDTH = 8  # points: as many doubles as the widest vector instructions take
-FLATTEST = (
-    0.2  # smallest J of points that are taken together; the others' errors would grow with 1 / J
-)
+# Smallest J of points that are taken together; the others' errors would grow with 1 / J
+FLATTEST = 0.2
 
 lanes = wp.types.vector(WIDTH, wp.float64)
 

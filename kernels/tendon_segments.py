@@ -16,9 +16,8 @@ from .points import MatrixPoints, matrix_at
 
 wp.set_module_options({"enable_backward": False})
 
-OFFSET_UNIT = (
-    5e-3  # unit of the offsets [m], about a cell size, so that the columns of F have similar norms
-)
+# Unit of the offsets [m], about a cell size, so that the columns of F have similar norms
+OFFSET_UNIT = 5e-3
 
 
 @wp.struct

@@ -194,8 +194,15 @@ class EnergySet:
             state = replace(state, memory=_without(prefix, state.memory))
         fixed = None if prefix else step.inputs.fixed_positions
         inputs = _without(prefix, step.inputs.actuation)
-        gravity, values = step.constants.gravity, step.constants.values[k]
-        return EnergyStep(state, step.stage, inputs, fixed, values, gravity, step.terms[k])
+        return EnergyStep(
+            state,
+            step.stage,
+            inputs,
+            fixed,
+            step.constants.values[k],
+            step.constants.gravity,
+            step.terms[k],
+        )
 
     def step_terms(self, step: SimulatorStep, near: torch.Tensor | None = None) -> StepTerms:
         """Returns the terms of a step, differentiable.

@@ -33,9 +33,8 @@ from .workspace import Workspace
 P = TypeVar("P")
 T = TypeVar("T")
 
-_REFINEMENTS = (
-    8  # iterations of an adjoint solve with a float32 factor before a float64 factor is used
-)
+# Iterations of an adjoint solve with a float32 factor before a float64 factor is used
+_REFINEMENTS = 8
 # Of the way of fixed vertices that bodies bar: a part of it, and their number.
 _LEAST_WAY, _MOST_PARTS = 1e-2, 32
 # Relative residuals: target, and limit if rounding prevents the target.

@@ -16,9 +16,8 @@ from .equilibrium import equilibrium, reaction_of
 
 _MOST_SETTLINGS = 100
 _REMEDY = "the step does not settle: take a smaller time step or internal forces"
-_SETTLED = (
-    1e-10  # change of the positions, or of the gradient, relative to their size; or some roundings
-)
+# Change of the positions, or of the gradient, relative to their size; or some roundings
+_SETTLED = 1e-10
 
 
 class TimeStep:

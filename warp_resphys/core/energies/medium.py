@@ -59,9 +59,8 @@ class Medium(Energy):
     tangential: Parameter = parameter(0.0, "drag_tangential", "", closed=True)
     layer: Parameter = parameter(0.0, "added_layer", "m", closed=True)
     buoyancy: bool = True  # whether buoyancy acts
-    faces: NDArray[np.int64] | None = (
-        None  # (F, n) faces, among `boundary_faces`, that the medium acts on; None: all
-    )
+    # (F, n) faces, among `boundary_faces`, that the medium acts on; None: all
+    faces: NDArray[np.int64] | None = None
 
     @override
     def points(self, mesh: Mesh) -> tuple[FacePoints, ...]:

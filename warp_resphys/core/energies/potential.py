@@ -144,9 +144,8 @@ class IncrementalPotential(Launcher):
         )
         self.all_active = True
         self.low_rank: torch.Tensor | None = None
-        self._stiff_columns: torch.Tensor | None = (
-            None  # the same, with components normal to symmetry planes
-        )
+        # The same, with components normal to symmetry planes
+        self._stiff_columns: torch.Tensor | None = None
         self._direction = self.zeros(n_vertices, 3)
         self._adjoints: list[Callable[[], dict[str, torch.Tensor]]] = []
 

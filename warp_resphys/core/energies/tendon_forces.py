@@ -62,9 +62,8 @@ OFFSETS = tuple(Quantity(f"tendon_offset_{k}", "m", per="tendon", typical=1e-3) 
 FRICTION = Quantity("tendon_friction", "", 0.0, closed=True, per="tendon")
 BRISTLE = Quantity("tendon_bristle_length", "m", 0.0, per="tendon")
 SEGMENT_TENSION = "tendon_segment_tension"
-ROUTE = (
-    "tendon_route"  # (B, T, 3) c of `kernels.tendon_segments`: one, and the offsets in their unit
-)
+# (B, T, 3) c of `kernels.tendon_segments`: one, and the offsets in their unit
+ROUTE = "tendon_route"
 # (B, P) of the guide before each segment: friction at the start of a step, its bounds downwards and
 # upwards [N], and length of the tendon beyond it then [m]
 STEP_VALUES = ("tendon_hold", "tendon_drop", "tendon_rise", "tendon_beyond")

@@ -32,9 +32,8 @@ from .solver_names import LinearSolverName
 from .tiled import TiledSolver
 
 LINEAR_SOLVERS: tuple[LinearSolverName, ...] = get_args(LinearSolverName)
-MAX_BANDED_FLOPS = (
-    4e10  # multiplications of a banded factor on a CPU above which CHOLMOD is cheaper
-)
+# Multiplications of a banded factor on a CPU above which CHOLMOD is cheaper
+MAX_BANDED_FLOPS = 4e10
 MAX_SMALL_FLOPS = 5e8  # multiplications of a banded factor up to which no other one is cheaper
 COMPACT = 30  # squared bandwidth over unknowns from which Pardiso is cheaper than a banded factor
 BORDER_FLOPS = 44  # of an unknown beside a band, in multiplications of a banded factor

@@ -49,9 +49,8 @@ class Point:
 class Problem(ABC):
     """A batch of independent sums of squares."""
 
-    follows_valleys = (
-        False  # whether a rejected step may be followed by a second one; of a batch of one
-    )
+    # Whether a rejected step may be followed by a second one; of a batch of one
+    follows_valleys = False
 
     @abstractmethod
     def evaluate(self, x: torch.Tensor) -> Point:

@@ -148,13 +148,12 @@ class Grips:
     def of(cls, pairs: PairList, sliding: Sliding) -> "Grips":
         """Returns friction of pairs (G, ...) (`kernels.contact.surface_pairs.FrictionPairs`)."""
         environment, nodes = sliding.environment, sliding.nodes
-        load = sliding.load
         kept = {
             name: (value if value.is_floating_point() else value.to(torch.int32)).contiguous()
             for name, value in sliding._asdict().items()
         }
         struct = struct_of(kernels.FrictionPairs, **kept)
-        sums = load.new_zeros(len(load), 4, 3), torch.zeros_like(load)
+        sums = sliding.load.new_zeros(len(nodes), 4, 3), torch.zeros_like(sliding.load)
         incidence = pairs.incidence(environment, nodes)
         outputs = [warp_view(sums[0], nearest_points.Corners), warp_view(sums[1], wp.float64)]
         return cls(environment, nodes, struct, outputs, [warp_view(x, wp.int32) for x in incidence])

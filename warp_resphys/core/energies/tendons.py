@@ -81,7 +81,7 @@ class Tendons(Energy):
     stiffness: Parameter = 0.0
     toe: float = 1e-4  # elongation at which the spring reaches its full stiffness [m]
     reach: float = 1e-3  # largest distance of a guide from the body [m]
-    # Coefficient mu in the guides, parameter ``tendon_friction``; None: no friction
+    # coefficient mu in the guides, parameter ``tendon_friction``; None: no friction
     friction: Parameter | None = None
     bristle_length: Parameter = 1e-4  # slide over which friction reverses [m]
 

@@ -83,7 +83,7 @@ class Contact(Energy):
     is_barrier: ClassVar[bool] = True
 
     obstacles: Mapping[str, Obstacle]
-    # Kappa [Pa], a number or one by obstacle, in order or by name
+    # kappa [Pa], a number or one by obstacle, in order or by name
     stiffness: Parameter | Mapping[str, float] = 1e5
     friction: Parameter | Mapping[str, float] = 0.0  # mu, likewise
     distance: float = 1e-3  # D [m]

@@ -369,8 +369,9 @@ class LawTerm(PartTerm):
         arrays: Sequence[str] = (),
     ) -> None:
         super().__init__(launcher, sets, shapes, count)
-        self._law, constants = point_law.law, point_law.constants
-        self._stiffness, self._kernels = point_law.stiffness, point_kernels(self._law)
+        self._law, self._stiffness = point_law.law, point_law.stiffness
+        self._kernels = point_kernels(self._law)
+        constants = point_law.constants
         self._shapes, self._arrays = dict(shapes), frozenset(arrays)
         self._constants = launcher.zeros(len(constants)) + torch.tensor(
             constants, device=launcher.device, dtype=torch.float64

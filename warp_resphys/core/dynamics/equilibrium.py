@@ -373,7 +373,7 @@ def _minimise(
         start[:, fixed] = fixed_positions
     report = minimiser.solve(potential.improved_start(start).to(start), None if parts else follows)
     solves = [*parts, report]
-    work = {
+    work: dict[str, Any] = {
         "iterations": sum(part.iterations for part in solves),
         "factorisations": sum(part.factorisations for part in solves),
     }

@@ -14,16 +14,13 @@ from typing import Any
 
 import warp as wp
 
+from .constants import HALF, ONE, QUARTER, SIXTH, THREE, TWO, ZERO
 from .laws import Law
 from .modules import named_module
 
-ZERO = wp.float64(0.0)
-HALF = wp.float64(0.5)
-ONE = wp.float64(1.0)
-TWO = wp.float64(2.0)
-THREE = wp.float64(3.0)
-SIXTH, TWENTY_FOURTH = wp.float64(1.0 / 6.0), wp.float64(1.0 / 24.0)
-QUARTER, TENTH, FORTIETH = wp.float64(0.25), wp.float64(0.1), wp.float64(0.025)
+TWENTY_FOURTH = wp.float64(1.0 / 24.0)
+TENTH = wp.float64(0.1)
+FORTIETH = wp.float64(0.025)
 
 
 @wp.func

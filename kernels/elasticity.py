@@ -7,6 +7,7 @@ from typing import Any
 
 import warp as wp
 
+from .constants import HALF, TWO, ZERO
 from .laws import Law
 from .modules import generated, named_module
 from .points import MatrixPoints, green_strain, matrix_at
@@ -15,7 +16,6 @@ wp.set_module_options({"enable_backward": False})
 
 # Of threads a block and blocks a multiprocessor: at most 128 registers a thread, of a GPU's 65,536.
 BOUNDS = (128, 4)
-ZERO, HALF, TWO, FOUR = wp.float64(0.0), wp.float64(0.5), wp.float64(2.0), wp.float64(4.0)
 
 
 @wp.kernel
@@ -137,7 +137,8 @@ def viscous_slopes(
 def viscosity_of(law: Law) -> SimpleNamespace:
     """Returns the struct of a material's values, and the viscosity at its points."""
     module, vector = named_module(law.name), law.values
-    mu_of, lambda_of = (vector(*(wp.float64(pair[i]) for pair in law.lame)) for i in (0, 1))
+    mu_of = vector(*(wp.float64(mu) for mu, _ in law.lame))
+    lambda_of = vector(*(wp.float64(lame_lambda) for _, lame_lambda in law.lame))
 
     @wp.struct
     class Values:
@@ -183,7 +184,8 @@ def viscosity_of(law: Law) -> SimpleNamespace:
 @generated
 def adjoint_kernel(law: Law) -> Any:
     """Returns the kernel of a material for derivatives by the values of a step."""
-    viscosity, slopes, vector = viscosity_of(law), law.slopes, law.values
+    viscosity = viscosity_of(law)
+    slopes, vector = law.slopes, law.values
     values_type = viscosity.Values
     lame_of = viscosity.lame_of
     mu_of = viscosity.mu_of
@@ -231,7 +233,8 @@ def adjoint_kernel(law: Law) -> Any:
 def solid_kernels(law: Law) -> SimpleNamespace:
     """Returns the kernels of a material, and the struct of its values."""
     module, viscosity = named_module(law.name), viscosity_of(law)
-    response, elastic_tangent, values_type = law.response, law.tangent, viscosity.Values
+    response, elastic_tangent = law.response, law.tangent
+    values_type = viscosity.Values
     respond, add_tangent = viscosity.respond, viscosity.add_tangent
 
     @wp.kernel(module=module, launch_bounds=BOUNDS)

@@ -19,13 +19,13 @@ from typing import Any
 
 import warp as wp
 
+from .constants import HALF, ONE, TWELVE, ZERO
 from .laws import Law
 from .modules import generated, named_module
 
 STEP = 3e-4  # of differences, over the size of f
 OFFSETS = wp.constant(wp.vec4d(1.0, -1.0, 2.0, -2.0))
 SHARES = wp.constant(wp.vec4d(8.0, -8.0, -1.0, 1.0))
-TWELVE, ZERO, HALF, ONE = wp.float64(12.0), wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
 SWEEPS = wp.constant(30)
 CONVERGED = wp.constant(wp.float64(1e-30))  # squared entries off the diagonal, over all
 

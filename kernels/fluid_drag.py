@@ -10,11 +10,10 @@ c = (linear, normal, tangential, inertial) of the step, its energy is
 
 import warp as wp
 
+from .constants import HALF, THIRD, ZERO
 from .points import VectorPoints, vector_at
 
 wp.set_module_options({"enable_backward": False})
-
-ZERO, HALF, THIRD = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0 / 3.0)
 
 
 @wp.func

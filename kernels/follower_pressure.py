@@ -2,10 +2,9 @@
 
 import warp as wp
 
+from .constants import ZERO
 from .laws import Law
 from .matrices import cofactor
-
-ZERO = wp.float64(0.0)
 
 vec4d = wp.types.vector(4, wp.float64)
 

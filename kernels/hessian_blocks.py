@@ -174,7 +174,8 @@ def projection_kernel(scalar: Any) -> Any:
         b, t = wp.tid()
         if active[b] == 0:
             return
-        block, row, column = blocks[t, 0], blocks[t, 1], blocks[t, 2]
+        block = blocks[t, 0]
+        row, column = blocks[t, 1], blocks[t, 2]
         total = wp.mat33d()
         for r in range(3):
             for c in range(3):

@@ -25,6 +25,7 @@ from typing import Any, Final
 
 import warp as wp
 
+from .constants import ZERO
 from .elasticity import viscosity_of
 from .laws import Law
 from .matrices import HALLEY_ITERATIONS, HALLEY_TOLERANCE, LARGEST_TRACE
@@ -32,10 +33,8 @@ from .modules import generated, named_module
 from .points import MatrixPoints, matrix_at
 
 WIDTH = 8  # points: as many doubles as the widest vector instructions take
-FLATTEST = (
-    0.2  # smallest J of points that are taken together; the others' errors would grow with 1 / J
-)
-ZERO = wp.float64(0.0)
+# Smallest J of points that are taken together; the others' errors would grow with 1 / J
+FLATTEST = 0.2
 
 lanes = wp.types.vector(WIDTH, wp.float64)
 
@@ -178,7 +177,8 @@ def cell_step(law: Law) -> Any:
     """Returns the kernel for forces and energies of a material
     whose shape term is that of `materials.corotated`.
     """
-    viscosity, response, vector = viscosity_of(law), law.response, law.values
+    viscosity = viscosity_of(law)
+    response, vector = law.response, law.values
     values_type, respond = viscosity.Values, viscosity.respond
 
     @wp.func_native(_STEP)
@@ -236,7 +236,8 @@ def cell_step(law: Law) -> Any:
 @generated
 def cell_tangent(law: Law) -> Any:
     """Returns the kernel for the tangents of the same materials."""
-    viscosity, elastic_tangent, vector = viscosity_of(law), law.tangent, law.values
+    viscosity = viscosity_of(law)
+    elastic_tangent, vector = law.tangent, law.values
     values_type, add_viscosity = viscosity.Values, viscosity.add_tangent
 
     @wp.func_native(_TANGENT)

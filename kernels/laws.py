@@ -46,7 +46,8 @@ class Law:
 def point_kernels(law: Law) -> SimpleNamespace:
     """Returns the kernels of a law whose values at a point are read from any number of arrays."""
     module = named_module(law.name)
-    response, slopes, write_tangent, vector = law.response, law.slopes, law.tangent, law.values
+    response, slopes = law.response, law.slopes
+    write_tangent, vector = law.tangent, law.values
     shape = response.input_types["f"]
     see, points_type = (vector_at, VectorPoints) if shape is wp.vec3d else (matrix_at, MatrixPoints)
     read_values = value_reader(vector)

@@ -10,9 +10,10 @@ from typing import Any
 
 import warp as wp
 
+from .constants import ZERO
 from .minimisation import FACTOR, FAILED, NEED_DIRECTION, LineSearch, SolverProgress, begin_search
 from .modules import generated, named_module
-from .reductions import ZERO, block_sum
+from .reductions import block_sum
 
 MIN_CURVATURE = wp.constant(wp.float64(1e-10))
 
@@ -80,18 +81,21 @@ def add_pair(
     pairs: Any, b: int, lane: int, step: wp.float64, search: LineSearch, after: wp.array2d[wp.vec3d]
 ):
     """Stores a pair of positive curvature, from the residual after a step."""
-    m, n, lanes = pairs.s.shape[1], after.shape[1], wp.block_dim()
+    m, n = pairs.s.shape[1], after.shape[1]
+    lanes = wp.block_dim()
     k = pairs.count[b]
     new = (pairs.last[b] + 1) % m
     s, y = pairs.s[b, new], pairs.y[b, new]
-    curvature, lengths, changes = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    curvature = wp.float64(0.0)
+    lengths, changes = wp.float64(0.0), wp.float64(0.0)
     for v in range(lane, n, lanes):
         moved = step * search.direction[b, v]
         changed = after[b, v] - search.gradient[b, v]
         curvature += wp.dot(moved, changed)
         lengths += wp.dot(moved, moved)
         changes += wp.dot(changed, changed)
-    curvature, lengths, changes = block_sum(curvature), block_sum(lengths), block_sum(changes)
+    curvature = block_sum(curvature)
+    lengths, changes = block_sum(lengths), block_sum(changes)
     if not curvature > MIN_CURVATURE * wp.sqrt(lengths * changes):
         return
     for v in range(lane, n, lanes):

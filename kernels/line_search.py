@@ -8,6 +8,7 @@ from typing import Any
 
 import warp as wp
 
+from .constants import HALF, ONE, ZERO
 from .lbfgs import add_pair, lbfgs_kernels
 from .minimisation import (
     DONE,
@@ -24,11 +25,10 @@ from .minimisation import (
     record_solution,
 )
 from .modules import generated, named_module
-from .reductions import ZERO, block_max, block_sum
+from .reductions import block_max, block_sum
 
 wp.set_module_options({"enable_backward": False})
 
-HALF, ONE = wp.float64(0.5), wp.float64(1.0)
 ARMIJO = wp.constant(wp.float64(1e-4))
 MAX_HALVINGS = wp.constant(25)
 # Rounding error of a sum of energies with cancellation, per unit of stiffness and of energy.
@@ -112,13 +112,15 @@ def within_rounding(
     """
     if iterations != 1 or progress.force[b] != wp.float64(0.0):
         return False
-    moved, size, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    moved, size = wp.float64(0.0), wp.float64(0.0)
+    square = wp.float64(0.0)
     for i in range(lane, inertia.shape[1], wp.block_dim()):
         for c in range(3):
             moved = wp.max(moved, wp.abs(search.direction[b, i][c]))
             size = wp.max(size, wp.abs(search.positions[b, i][c]))
         square += inertia[b, i] * inertia[b, i]
-    moved, size, square = block_max(moved), block_max(size), block_sum(square)
+    moved, size = block_max(moved), block_max(size)
+    square = block_sum(square)
     rounding = tolerances.epsilon * size
     return moved <= rounding and scale <= wp.float64(2.0) * rounding * wp.sqrt(square)
 

@@ -4,6 +4,8 @@ signed SVD, and the tangent of an isotropic energy.
 
 import warp as wp
 
+from .constants import HALF, ONE, ZERO
+
 # Squared norms of the last update at which an iteration has converged to rounding: Newton's is of
 # second order, Halley's of third.
 NEWTON_TOLERANCE, HALLEY_TOLERANCE = wp.float64(1.0e-16), wp.float64(1.0e-11)
@@ -12,7 +14,6 @@ HALLEY_ITERATIONS = 12
 LARGEST_TRACE = wp.float64(12.0)
 SMALLEST_STRETCH_SUM = wp.float64(1.0e-3)  # lower bound of sums of stretches in denominators
 SINGULAR, ROUNDING = wp.float64(1.0e-12), wp.float64(1.0e-32)
-ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
 
 
 @wp.func

@@ -20,6 +20,7 @@ corrections: none, a constant, a line or a parabola.
 
 import warp as wp
 
+from .constants import ONE
 from .reductions import block_sum
 
 wp.set_module_options({"enable_backward": False})
@@ -34,7 +35,6 @@ INFINITE = wp.constant(wp.float64(float("inf")))
 # A higher order, which amplifies fast modes, is used only if it reduces the squared error to this
 # fraction.
 IMPROVEMENT = wp.constant(wp.float64(0.1))
-ONE = wp.float64(1.0)
 
 
 @wp.struct

@@ -11,11 +11,10 @@ from typing import Any
 
 import warp as wp
 
+from .constants import HALF, ZERO
 from .modules import generated, named_module
 
 wp.set_module_options({"enable_backward": False})
-
-ZERO, HALF = wp.float64(0.0), wp.float64(0.5)
 
 
 @wp.struct

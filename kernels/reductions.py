@@ -10,9 +10,6 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 
-ZERO = wp.float64(0.0)
-
-
 @wp.func
 def block_sum(value: wp.float64) -> wp.float64:
     """Returns the sum over a block, in every thread."""
@@ -58,7 +55,8 @@ def totals(
     for the line search and the convergence test.
     """
     b, lane = wp.tid()
-    energy, size, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    energy, size = wp.float64(0.0), wp.float64(0.0)
+    square = wp.float64(0.0)
     for i in range(lane, free.shape[0], wp.block_dim()):
         if free[i] == wp.float64(0.0) and active[b] != 0:
             fixed_out[b, i] = residual_out[b, i]
@@ -70,7 +68,8 @@ def totals(
     for p in range(lane, point_energy.shape[1], wp.block_dim()):
         energy += point_energy[b, p]
         size += wp.abs(point_energy[b, p])
-    energy, size, square = block_sum(energy), block_sum(size), block_sum(square)
+    energy, size = block_sum(energy), block_sum(size)
+    square = block_sum(square)
     if lane == 0 and active[b] != 0:
         energy_out[b] = energy
         size_out[b] = size

@@ -11,14 +11,53 @@ each segment adds the friction of `bristle`, which depends on the length of the 
 import warp as wp
 
 from .axial import thread_pull
+from .constants import ONE, ZERO
 from .points import MatrixPoints, matrix_at
 
 wp.set_module_options({"enable_backward": False})
 
-ZERO, ONE = wp.float64(0.0), wp.float64(1.0)
-OFFSET_UNIT = (
-    5e-3  # unit of the offsets [m], about a cell size, so that the columns of F have similar norms
-)
+# Unit of the offsets [m], about a cell size, so that the columns of F have similar norms
+OFFSET_UNIT = 5e-3
+
+
+@wp.struct
+class Segments:
+    """Constants of the segments of tendons, which follow one another from the first guide."""
+
+    anchors: wp.array[wp.mat33d]  # (P) ends that are fixed in the world [m]
+    rest: wp.array[wp.mat33d]  # (P) F of the undeformed body
+    tendon: wp.array[int]  # (P)
+    first: wp.array[int]  # (T + 1) first segment of each tendon
+
+
+@wp.struct
+class TendonValues:
+    """Values of each tendon in a step."""
+
+    route: wp.array2d[wp.vec3d]  # (B, T) c
+    commanded: wp.array2d[wp.float64]  # (B, T) tension [N]
+    contraction: wp.array2d[wp.float64]  # (B, T) [m]
+    stiffness: wp.array2d[wp.float64]  # (B, T) of the spring [N/m]
+
+
+@wp.struct
+class GuideFriction:
+    """Friction of the guide before each segment, at the start of a step."""
+
+    hold: wp.array2d[wp.float64]  # (B, P) friction [N]
+    drop: wp.array2d[wp.float64]  # (B, P) its bounds, downwards and upwards [N]
+    rise: wp.array2d[wp.float64]
+    beyond: wp.array2d[wp.float64]  # (B, P) tendon beyond that guide [m]
+    bristles: wp.array2d[wp.float64]  # (B, T) bristle length [m]
+
+
+@wp.struct
+class Pulls:
+    """Results of `pull`."""
+
+    tension: wp.array2d[wp.float64]  # (B, P) of each segment [N]
+    spring: wp.array2d[wp.vec3d]  # (B, T) energy, force, slope at stiffness one [m^2, m, -]
+    friction: wp.array2d[wp.vec3d]  # (B, P) energy [J], slide [m], slope [N/m] before it
 
 
 @wp.func
@@ -50,9 +89,11 @@ def bristle(
     """Returns energy, force and slope of a guide's friction after a slide
     (``energies.tendon_forces``).
     """
-    size, start, most, sign = slide, hold, rise, ONE
+    size, start = slide, hold
+    most, sign = rise, ONE
     if slide < ZERO:
-        size, start, most, sign = -slide, -hold, drop, -ONE
+        size, start = -slide, -hold
+        most, sign = drop, -ONE
     left = (start - most) * wp.exp(-size / length)
     return (
         most * size + length * (start - most - left),
@@ -65,61 +106,52 @@ def bristle(
 def pull(
     active: wp.array[int],  # (B) zero: skip the environment
     points: MatrixPoints,
-    anchors: wp.array[wp.mat33d],
-    first: wp.array[int],  # (T + 1) first segment of each tendon
-    rest: wp.array[wp.mat33d],  # (P) F of the undeformed body
+    segments: Segments,
     toe: wp.float64,  # elongation at which the spring reaches its full stiffness [m]
-    route: wp.array2d[wp.vec3d],  # (B, T) c
-    commanded: wp.array2d[wp.float64],  # (B, T) tension [N]
-    contraction: wp.array2d[wp.float64],  # (B, T) [m]
-    stiffness: wp.array2d[wp.float64],  # (B, T) of the spring [N/m]
-    hold: wp.array2d[wp.float64],  # (B, P) friction of the guide before each at the start [N]
-    drop: wp.array2d[wp.float64],  # (B, P) its bounds, downwards and upwards [N]
-    rise: wp.array2d[wp.float64],
-    beyond: wp.array2d[wp.float64],  # (B, P) tendon beyond that guide at the start [m]
-    bristles: wp.array2d[wp.float64],  # (B, T) bristle length [m]
+    values: TendonValues,
+    friction: GuideFriction,
     positions: wp.array2d[wp.vec3d],
-    tension_out: wp.array2d[wp.float64],  # (B, P) of each segment [N]
-    spring_out: wp.array2d[wp.vec3d],  # (B, T) energy, force, slope at stiffness one [m^2, m, -]
-    friction_out: wp.array2d[wp.vec3d],  # (B, P) energy [J], slide [m], slope [N/m] before it
+    pulls_out: Pulls,
 ):
     """Computes spring, friction and tensions of each tendon."""
     b, t = wp.tid()
     if active[b] == 0:
         return
-    c = route[b, t]
+    c = values.route[b, t]
+    begin = segments.first[t]
+    end = segments.first[t + 1]
     longer = wp.float64(0.0)
     length = wp.float64(0.0)
-    for k in range(first[t + 1] - first[t]):
-        p = first[t + 1] - 1 - k  # from the end, as friction depends on the length beyond a guide
-        span = wp.length(segment(points, positions, anchors, b, p) * c)
+    for k in range(end - begin):
+        p = end - 1 - k  # from the end, as friction depends on the length beyond a guide
+        span = wp.length(segment(points, positions, segments.anchors, b, p) * c)
         length += span
-        longer += span - wp.length(rest[p] * c)
-        slide = length - beyond[b, p]
-        energy, force, slope = bristle(slide, hold[b, p], drop[b, p], rise[b, p], bristles[b, t])
-        friction_out[b, p] = wp.vec3d(energy, slide, slope)
-        tension_out[b, p] = force
-    energy, force, slope = thread_pull(longer + contraction[b, t], toe)
-    spring_out[b, t] = wp.vec3d(energy, force, slope)
-    tension = commanded[b, t] + stiffness[b, t] * force
-    for p in range(first[t], first[t + 1]):
-        tension += tension_out[b, p]
-        tension_out[b, p] = tension
+        longer += span - wp.length(segments.rest[p] * c)
+        slide = length - friction.beyond[b, p]
+        energy, force, slope = bristle(
+            slide,
+            friction.hold[b, p],
+            friction.drop[b, p],
+            friction.rise[b, p],
+            friction.bristles[b, t],
+        )
+        pulls_out.friction[b, p] = wp.vec3d(energy, slide, slope)
+        pulls_out.tension[b, p] = force
+    energy, force, slope = thread_pull(longer + values.contraction[b, t], toe)
+    pulls_out.spring[b, t] = wp.vec3d(energy, force, slope)
+    tension = values.commanded[b, t] + values.stiffness[b, t] * force
+    for p in range(begin, end):
+        tension += pulls_out.tension[b, p]
+        pulls_out.tension[b, p] = tension
 
 
 @wp.kernel
 def local_step(
     active: wp.array[int],  # (B) zero: skip the environment
     points: MatrixPoints,
-    anchors: wp.array[wp.mat33d],
-    first: wp.array[int],
-    tendon: wp.array[int],  # (P)
-    route: wp.array2d[wp.vec3d],
-    commanded: wp.array2d[wp.float64],
-    stiffness: wp.array2d[wp.float64],
-    total: wp.array2d[wp.float64],  # (B, P) tension, from `pull` like the next two
-    spring: wp.array2d[wp.vec3d],
-    friction: wp.array2d[wp.vec3d],
+    segments: Segments,
+    values: TendonValues,
+    pulls: Pulls,
     positions: wp.array2d[wp.vec3d],
     stress_out: wp.array2d[wp.mat33d],
     energy_out: wp.array2d[wp.float64],
@@ -131,13 +163,13 @@ def local_step(
     b, p = wp.tid()
     if active[b] == 0:
         return
-    t = tendon[p]
-    c = route[b, t]
-    line = segment(points, positions, anchors, b, p) * c
-    energy = commanded[b, t] * wp.length(line) + friction[b, p][0]
-    if p == first[t]:
-        energy += stiffness[b, t] * spring[b, t][0]
-    stress_out[b, p] = total[b, p] * wp.outer(direction_of(line), c)
+    t = segments.tendon[p]
+    c = values.route[b, t]
+    line = segment(points, positions, segments.anchors, b, p) * c
+    energy = values.commanded[b, t] * wp.length(line) + pulls.friction[b, p][0]
+    if p == segments.first[t]:
+        energy += values.stiffness[b, t] * pulls.spring[b, t][0]
+    stress_out[b, p] = pulls.tension[b, p] * wp.outer(direction_of(line), c)
     energy_out[b, p] = energy
 
 
@@ -146,10 +178,9 @@ def tangent(
     active: wp.array[int],
     clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
     points: MatrixPoints,
-    anchors: wp.array[wp.mat33d],
-    tendon: wp.array[int],
+    segments: Segments,
     route: wp.array2d[wp.vec3d],
-    total: wp.array2d[wp.float64],
+    total: wp.array2d[wp.float64],  # (B, P) tension, from `pull`
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],
 ):
@@ -163,8 +194,8 @@ def tangent(
     b, p = wp.tid()
     if active[b] == 0:
         return
-    c = route[b, tendon[p]]
-    line = segment(points, positions, anchors, b, p) * c
+    c = route[b, segments.tendon[p]]
+    line = segment(points, positions, segments.anchors, b, p) * c
     length = wp.length(line)
     stiffness = ZERO
     if length > ZERO:

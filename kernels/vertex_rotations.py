@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .constants import ONE, THIRD
 from .matrices import polar_rotation
 from .points import MatrixPoints, matrix_at
 
@@ -9,7 +10,6 @@ wp.set_module_options({"enable_backward": False})
 
 # Of determinants; gradients are scaled by the mean volume of cells.
 SMALLEST = wp.constant(wp.float64(1.0e-30))
-THIRD, ONE = wp.float64(1.0 / 3.0), wp.float64(1.0)
 
 
 @wp.kernel

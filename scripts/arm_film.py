@@ -41,7 +41,9 @@ def recorded(
     the goal (3,) [m], and frames a second.
     """
     robots = make_vector("pick_and_place", run, 1, seconds=SECONDS)
-    world, policy, vertices, arms = robots.world, ScriptedPlace(robots), [], []
+    world = robots.world
+    policy = ScriptedPlace(robots)
+    vertices, arms = [], []
     assert isinstance(world, ArmWorld)
     seen, _ = robots.reset(seed=3)
     for _ in range(robots.actions):
@@ -61,7 +63,9 @@ def scene_of(run: str) -> RenderScene:
     """Returns the film of an episode."""
     world, vertices, arms, goal, rate = recorded(run)
     state = world.rest
-    triangles, (carriers, _), around = world.bodies(state)[0], world.rigid(state), world.obstacles()
+    triangles = world.bodies(state)[0]
+    carriers, _ = world.rigid(state)
+    around = world.obstacles()
     of_ball = (triangles >= world.ball.start).all(axis=1) & (triangles < world.ball.stop).all(
         axis=1
     )

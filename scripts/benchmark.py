@@ -134,8 +134,12 @@ def command_line() -> argparse.ArgumentParser:
         "sizes", parents=[shared, body], help="by size of the body and linear solver"
     )
     sizes.set_defaults(measure=steps.measure_sizes)
-    linear = ["banded", "sparse", "pardiso"]
-    sizes.add_argument("--linear-solvers", nargs="+", choices=LINEAR_SOLVERS, default=linear)
+    sizes.add_argument(
+        "--linear-solvers",
+        nargs="+",
+        choices=LINEAR_SOLVERS,
+        default=["banded", "sparse", "pardiso"],
+    )
     sizes.add_argument("--refinements", nargs="+", type=float, default=[1.0, 2.0, 3.0, 4.0, 5.0])
     follow = parts.add_parser(
         "twin", parents=[shared], help="a twin that follows the trials of a run"

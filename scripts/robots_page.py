@@ -168,7 +168,8 @@ def _robot_section(name: str, row: Mapping[str, Any], pictures: Path) -> list[st
         f"Tested on {count} trial{'s' if count > 1 else ''}, {row['how']}: "
         f"{', '.join(row['tested'])}."
     )
-    if pair := row["beside"]:
+    pair = row["beside"]
+    if pair:
         means = {
             model: row["errors_mm"][model]["mean"] for model in (pair["corrected"], pair["other"])
         }

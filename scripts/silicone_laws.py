@@ -105,7 +105,8 @@ class Tension:
 
 def main(arguments: Sequence[str]) -> None:
     """Writes the laws and the tables of the page."""
-    if len(arguments) != 1 or not (files := sorted(Path(arguments[0]).glob("*.csv"))):
+    files = sorted(Path(arguments[0]).glob("*.csv")) if len(arguments) == 1 else []
+    if not files:
         raise SystemExit("give the folder with the tables of the Soft Robotics Materials Database.")
     tests = {path.stem: Tension.read(path) for path in files}
     laws = {name: tests[file].law(SHIPPED, density) for name, (file, density, _) in LAWS.items()}
@@ -148,7 +149,7 @@ def _laws(laws: dict[str, MeasuredLaw]) -> list[str]:
             f"{modulus:.1f}",
             f"{error:.1f} %",
             f"{at_100:.0f}",
-            "" if (sheet := LAWS[name][2]) is None else f"{PSI * sheet:.0f}",
+            "" if sheet is None else f"{PSI * sheet:.0f}",
         ]
         rows.append(f"| `{name}` | {' | '.join(cells)} |")
     return rows

@@ -7,13 +7,12 @@ start of the step.
 
 import warp as wp
 
+from ..constants import FOUR, ONE, THIRD, TWO, ZERO
 from ..points import VectorPoints, vector_at
 from .signed_distances import GRID, Obstacles, distance, turn_slope
 
 wp.set_module_options({"enable_backward": False})
 
-ZERO, ONE, TWO, FOUR = (wp.float64(v) for v in (0.0, 1.0, 2.0, 4.0))
-THIRD = wp.float64(1.0 / 3.0)
 INFINITE, UNDEFINED = wp.constant(wp.float64(float("inf"))), wp.constant(wp.float64(float("nan")))
 ADVANCES = wp.constant(100)  # along a way beside an obstacle that is not convex
 KEPT = wp.constant(wp.float64(0.1))  # share of a gap that one iterate leaves at least
@@ -193,7 +192,8 @@ def adjoint(
     slopes_out.growth[b, p, k] = -a
     slopes_out.place[b, p, k] = -(a * at.n + at.h * w)
     slopes_out.turn[b, p, k] = turn_slope(o, b, k, x, at, a, w)
-    mu, load, m = f.coefficient[b, k], f.load[b, p, k], f.normal[b, p, k]
+    mu = f.coefficient[b, k]
+    load, m = f.load[b, p, k], f.normal[b, p, k]
     u, way = slide(f, b, p, k, x), x - f.reference[b, p, k]
     v = smoothed(wp.length(u), f.slip[b, 0])
     work = -v[1] * wp.dot(u, z)

@@ -11,11 +11,11 @@ t_k of the weights, with e_k = sum_i t_ki x_i, the distance has the second deriv
 
 import warp as wp
 
-from .barriers import KEPT, ONE, ZERO
+from ..constants import HALF, ONE, QUARTER, ZERO
+from .barriers import KEPT
 
 wp.set_module_options({"enable_backward": False})
 
-HALF, QUARTER = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(0.25))
 VERTEX_TRIANGLE, EDGE_EDGE = wp.constant(0), wp.constant(1)
 SLENDER = wp.constant(wp.float64(1e-2))  # square of the sine below which edges give no exact normal
 TRIANGLE_FEATURES, EDGE_FEATURES = wp.constant(7), wp.constant(9)  # of a pair of a kind (`nearest`)
@@ -93,7 +93,8 @@ def on_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec2d:
     """Returns the shares of the ways from a to b and from c to d
     at which the two are nearest (Ericson 2005).
     """
-    e, f, r = b - a, d - c, a - c
+    e, f = b - a, d - c
+    r = a - c
     ee, ff, ef = wp.dot(e, e), wp.dot(f, f), wp.dot(e, f)
     er, fr = wp.dot(e, r), wp.dot(f, r)
     whole = ee * ff - ef * ef
@@ -181,7 +182,8 @@ def nearest(kind: int, feature: int, x: Corners) -> Nearest:
     to 6 its corners. Features of two edges: 3 i + j, where i and j are 0 for an edge, 1 and 2 for
     its ends.
     """
-    w, t, s = wp.vec4d(), wp.vec4d(), wp.vec4d()
+    w = wp.vec4d()
+    t, s = wp.vec4d(), wp.vec4d()
     free = 0
     if kind == VERTEX_TRIANGLE:
         w, free, t, s = triangle_weights(feature, x)
@@ -193,10 +195,11 @@ def nearest(kind: int, feature: int, x: Corners) -> Nearest:
     if out.d > ZERO:
         out.n = r / out.d
     if free == 2:
-        x0, x1, x2, x3 = x[0], x[1], x[2], x[3]
-        e, f, across = x1 - x0, x3 - x2, x0 - x2
+        e, f = x[1] - x[0], x[3] - x[2]
+        across = x[0] - x[2]
         if kind == VERTEX_TRIANGLE:
-            e, f, across = x2 - x1, x3 - x1, x0 - x1
+            e, f = x[2] - x[1], x[3] - x[1]
+            across = x[0] - x[1]
         normal = wp.cross(e, f)
         square = wp.dot(normal, normal)
         if square > SLENDER * wp.dot(e, e) * wp.dot(f, f):  # more digits than by the weights
@@ -224,7 +227,8 @@ def part(kind: int, feature: int, degree: wp.vec4d) -> wp.float64:
         if feature < 4:
             return -HALF
         return ONE / degree[feature - 3]
-    first, second, out = feature / 3, feature % 3, ONE
+    first, second = feature / 3, feature % 3
+    out = ONE
     if first > 0:
         out = -out * (ONE - ONE / degree[first - 1])
     if second > 0:
@@ -244,9 +248,11 @@ def corners(positions: wp.array2d[wp.vec3d], b: int, v: wp.vec4i) -> Corners:
 @wp.func
 def apart(kind: int, x: Corners, most: wp.float64) -> bool:
     """Returns whether the boxes of the two parts of a pair are further apart than a distance."""
-    low, high, one = x[0], x[0], x[1]
+    low, high = x[0], x[0]
+    one = x[1]
     if kind == EDGE_EDGE:
-        low, high, one = wp.min(x[0], x[1]), wp.max(x[0], x[1]), x[2]
+        low, high = wp.min(x[0], x[1]), wp.max(x[0], x[1])
+        one = x[2]
     a = wp.min(wp.min(one, x[2]), x[3]) - high
     b = low - wp.max(wp.max(one, x[2]), x[3])
     return wp.max(wp.max(wp.max(a[0], a[1]), a[2]), wp.max(wp.max(b[0], b[1]), b[2])) > most

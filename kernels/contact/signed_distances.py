@@ -18,11 +18,11 @@ obstacle is its z.
 
 import warp as wp
 
+from ..constants import FOUR, HALF, ONE, SIXTH, THREE, TWO, ZERO
+
 wp.set_module_options({"enable_backward": False})
 
 HALF_SPACE, SPHERE, CAPSULE, BOX, CYLINDER, GRID = (wp.constant(k) for k in range(6))
-ZERO, ONE, HALF, SIXTH = wp.float64(0.0), wp.float64(1.0), wp.float64(0.5), wp.float64(1.0 / 6.0)
-TWO, THREE, FOUR = wp.float64(2.0), wp.float64(3.0), wp.float64(4.0)
 LEAST = wp.constant(wp.float64(1e-150))  # keeps a division by a length defined
 
 

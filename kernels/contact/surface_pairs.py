@@ -4,8 +4,9 @@
 
 import warp as wp
 
+from ..constants import ONE, TWO, ZERO
 from ..points import VectorPoints, vector_at
-from .barriers import INFINITE, ONE, TWO, UNDEFINED, ZERO, barrier, slide_tangent, smoothed
+from .barriers import INFINITE, UNDEFINED, barrier, slide_tangent, smoothed
 from .nearest_points import EDGE_EDGE, Corners, Pairs, apart, corners, features, nearest, part
 
 wp.set_module_options({"enable_backward": False})
@@ -172,7 +173,8 @@ def pair_tangents(
                 block[r, r] = block[r, r] + bend
             # The inverse of G, by the numbers of directions.
             et, es = at.t * x, at.s * x
-            tt, ss, ts = wp.dot(et, et), wp.dot(es, es), wp.dot(et, es)
+            tt, ss = wp.dot(et, et), wp.dot(es, es)
+            ts = wp.dot(et, es)
             g = wp.vec3d()  # G_11, G_22, G_12
             if at.free == 1:
                 g[0] = ONE / tt
@@ -259,7 +261,8 @@ def grip_slide(
     """Returns u, the relative way of the two parts of a pair since the step began,
     in its tangential plane.
     """
-    b, v, w, n = grips.environment[g], grips.nodes[g], grips.weights[g], grips.normal[g]
+    b, v = grips.environment[g], grips.nodes[g]
+    w, n = grips.weights[g], grips.normal[g]
     way = w * (corners(positions, b, v) - corners(reference, b, v))
     return way - wp.dot(way, n) * n
 

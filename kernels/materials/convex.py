@@ -32,6 +32,7 @@ from typing import Any
 
 import warp as wp
 
+from ..constants import FOUR, ONE, THREE, TWELVE, TWO, ZERO
 from ..laws import Law
 from ..matrices import SMALLEST_STRETCH_SUM, cofactor, polar_rotation, signed_svd, spectral_blocks
 from ..modules import generated, named_module
@@ -43,8 +44,6 @@ _B, _J = POWERS_OF_A, POWERS_OF_A + POWERS_OF_B
 _G2, _G4 = _J + 1, _J + 2
 ISOTROPIC = _J + 3  # number of coefficients of invariants
 _OGDEN = ISOTROPIC + 2  # index of the first of Ogden's moduli
-ZERO, ONE, TWO, FOUR = wp.float64(0.0), wp.float64(1.0), wp.float64(2.0), wp.float64(4.0)
-THREE, TWELVE = wp.float64(3.0), wp.float64(12.0)
 
 coefficients = wp.types.vector(ISOTROPIC, wp.float64)
 

@@ -23,6 +23,7 @@ loop over matrices. U follows from C as in `kernels.lanes`.
 
 import warp as wp
 
+from ..constants import EIGHT, FOUR, HALF, ONE, THREE, TWELVE, TWO, ZERO
 from ..laws import Law
 from ..matrices import (
     HALLEY_ITERATIONS,
@@ -43,8 +44,6 @@ NEARLY_A_LINE = wp.float64(1.0e-3)
 # |J - 1| up to which Newton's iteration converges, and to the nearest D
 LARGEST_GROWTH = wp.float64(0.4)
 NEWTON_ITERATIONS, PROJECTIONS = 8, 60
-ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
-THREE, FOUR, EIGHT, TWELVE = wp.float64(3.0), wp.float64(4.0), wp.float64(8.0), wp.float64(12.0)
 
 
 @wp.func
@@ -71,7 +70,8 @@ def multiplier(i1: wp.float64, i2: wp.float64, growth: wp.float64):
     change = ONE
     for _ in range(NEWTON_ITERATIONS):
         t1 = i1 - m * t2
-        p, a, b = t1 * t2 - THREE, t2 * t2 - TWO * t1, t1 * t1 - TWO * t2
+        p = t1 * t2 - THREE
+        a, b = t2 * t2 - TWO * t1, t1 * t1 - TWO * t2
         first = t2 + m * (p + m * t1) - i2
         second = m * (a + m * (b + m)) - growth
         # derivatives by m and t_2, with t_1 = i_1 - m t_2
@@ -135,7 +135,9 @@ def unimodular_offset(f: wp.mat33d) -> wp.mat33d:
             # by U^3 = i_1 U^2 - i_2 U + J I, V^-1 = (y_0 I + y_1 U + y_2 C) / n
             g = i1 * i2 - j
             bend = i1 * i1 - i2
-            y0, y1, y2 = w0 + w3 * j + q2 * i1 * j, w1 - w3 * i2 - q2 * g, w2 + w3 * i1 + q2 * bend
+            y0 = w0 + w3 * j + q2 * i1 * j
+            y1 = w1 - w3 * i2 - q2 * g
+            y2 = w2 + w3 * i1 + q2 * bend
             # by J U^-1 = C - i_1 U + i_2 I and g U = bend C - C^2 + i_1 J I
             k = y0 / j
             u = (y2 - k * i1) / g

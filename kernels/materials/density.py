@@ -10,11 +10,11 @@ from typing import Any
 
 import warp as wp
 
+from ..constants import ZERO
 from ..energy_functions import derived_law
 from ..laws import Law
 from ..modules import named_module
 
-ZERO = wp.float64(0.0)
 FIRST = 4  # index of the first parameter among the values
 
 

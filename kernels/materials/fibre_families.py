@@ -5,9 +5,8 @@
 import warp as wp
 
 from ..axial import muscle_pull
+from ..constants import FOUR, HALF, ONE, SIX, THREE, TWO, ZERO
 
-ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
-THREE, FOUR, SIX = wp.float64(3.0), wp.float64(4.0), wp.float64(6.0)
 SMALLEST = wp.float64(1.0e-12)  # lower bound of a squared length in a denominator
 
 Family = wp.types.vector(8, wp.float64)  # unit vector e, slack, toe, k_f, k_3 and k_c

@@ -10,11 +10,9 @@ by mu so that small strains give exactly linear elasticity.
 
 import warp as wp
 
+from ..constants import FOUR, HALF, ONE, THREE, TWO, ZERO
 from ..laws import Law
 from ..matrices import cofactor, signed_svd, spectral_blocks
-
-ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
-THREE, FOUR = wp.float64(3.0), wp.float64(4.0)
 
 
 @wp.func

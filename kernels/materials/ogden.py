@@ -4,9 +4,9 @@ without their part in j.
 
 import warp as wp
 
+from ..constants import ONE, THREE, TWO, ZERO
 from ..matrices import cofactor, polar_rotation, signed_svd
 
-ZERO, ONE, TWO, THREE = wp.float64(0.0), wp.float64(1.0), wp.float64(2.0), wp.float64(3.0)
 IDENTITY = wp.mat33d(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 

@@ -30,10 +30,16 @@ from warp_resphys.experiment.build import choose_device
 
 from .measuring import free_unknowns, now, solves, take_turns
 
-LENGTH, SIDE, RADIUS, TABLE, GAP = 0.08, 0.014, 0.012, -0.083, 1.5e-3  # [m]
+LENGTH, SIDE = 0.08, 0.014  # of a finger [m]
+RADIUS: Final = 0.012  # of the ball [m]
+TABLE: Final = -0.083  # height of the table [m]
+GAP: Final = 1.5e-3  # between a finger and the ball [m]
 D: Final = 5e-4  # distance at which contact begins [m]
-STIFFNESS, FRICTION, SLIP_SPEED = 5e4, 0.5, 5e-3  # [Pa], 1, [m/s]
-CLOSED, LIFTED, RISE, TIME_STEP = 0.2, 0.5, 0.03, 0.01  # times [s] and height [m] of a grasp
+STIFFNESS: Final = 5e4  # [Pa]
+FRICTION, SLIP_SPEED = 0.5, 5e-3  # 1, [m/s]
+CLOSED, LIFTED = 0.2, 0.5  # times of a grasp [s]
+RISE: Final = 0.03  # [m]
+TIME_STEP: Final = 0.01  # [s]
 TENSIONS: Final = (1.2, 1.8)  # of the first and the last gripper [N]; one alone has the largest
 RUBBER: Final = Corotated(
     youngs_modulus=2.5e5, poissons_ratio=0.45, density=1070.0, stiffness_damping=4e-3

@@ -68,10 +68,9 @@ def take_turns(
 
 def solves(path: Motion) -> dict[str, float]:
     """Returns the mean numbers of iterations and factorisations in a step of a roll-out."""
-    counts = ("iterations", "factorisations")
     return {
         name: float(np.mean([getattr(r, name).double().mean().item() for r in path.reports]))
-        for name in counts
+        for name in ("iterations", "factorisations")
     }
 
 

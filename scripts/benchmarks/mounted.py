@@ -36,7 +36,8 @@ _LAST_MASS: Final = 0.1  # of the mounting body [kg]
 
 def arm(time_step: float) -> str:
     """Returns the MJCF of an arm of six joints, whose last body is the flange."""
-    bodies, ends, place = "", "", "0 0 .1"
+    bodies, ends = "", ""
+    place = "0 0 .1"
     for number, (length, axis) in enumerate(_LINKS):
         name, mass = ("flange", _LAST_MASS) if number == 5 else (f"link_{number}", 10.0 * length)
         bodies += (

@@ -47,8 +47,13 @@ Array = NDArray[np.float64]
 Run = Callable[[Array, Array, int], tuple[float, Array]]
 OURS: Final = "warp_resphys"
 SIZE: Final = (0.06, 0.04, 0.03)  # of the block [m]
-MODULUS, RATIO, DENSITY, G = 30e3, 0.45, 1070.0, 9.81  # SI units
-FRICTION, SLIP_SPEED, STIFFNESS, SPEED = 0.5, 1e-3, 1e5, 1.0  # 1, [m/s], [Pa], [m/s]
+MODULUS: Final = 30e3  # [Pa]
+RATIO: Final = 0.45
+DENSITY: Final = 1070.0  # [kg/m^3]
+G: Final = 9.81  # [m/s^2]
+FRICTION, SLIP_SPEED = 0.5, 1e-3  # 1, [m/s]
+STIFFNESS: Final = 1e5  # [Pa]
+SPEED: Final = 1.0  # [m/s]
 SQUEEZE: Final = 0.1  # share of the width by which walls squeeze the block that is held
 SETTLING, DURATION = 0.1, 0.25  # before the block is given its speed, and after [s]
 # Of the programs, the time step [s] first.
@@ -300,8 +305,9 @@ def flex(
     spec = mujoco.MjSpec()
     spec.memory = 1 << 28
     option = spec.option
-    # As advised for grasping.
-    option.timestep, option.gravity, option.impratio = h, (0.0, 0.0, -G), 10.0
+    option.timestep = h
+    option.gravity = (0.0, 0.0, -G)
+    option.impratio = 10.0  # as advised for grasping
     option.integrator, option.cone = (
         mujoco.mjtIntegrator.mjINT_DISCRETE,
         mujoco.mjtCone.mjCONE_ELLIPTIC,
@@ -324,12 +330,9 @@ def flex(
             body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
     block = spec.add_flex(name="block", dim=3, young=MODULUS, poisson=RATIO, radius=0.0)
     block.elastic3d, block.selfcollide = 1, mujoco.mjtFlexSelf.mjFLEXSELF_NONE
-    block.vertbody, block.elem, block.contype, block.conaffinity = (
-        names,
-        mesh.cells.ravel().tolist(),
-        1,
-        1,
-    )
+    block.vertbody = names
+    block.elem = mesh.cells.ravel().tolist()
+    block.contype = block.conaffinity = 1
     model, rest = spec.compile(), mesh.vertices
     data = mujoco.MjData(model)
 

@@ -63,7 +63,8 @@ def measure_twin(arguments: argparse.Namespace) -> dict[str, Any]:
                 "p99_ms": np.percentile(estimates, 99),
             }
             rows.append({**row, "prediction_ms": np.median(predictions)})
-            if (off := twin.disagreement) is not None:
+            off = twin.disagreement
+            if off is not None:
                 rows[-1] |= {"twin_mm": off.twin, "held_mm": off.held, "engine_mm": off.simulator}
                 rows[-1] |= {
                     "covered": off.covered,

@@ -130,7 +130,8 @@ class HessianAssembly:
         scalar = wp.float64 if solver.dtype == torch.float64 else wp.float32
         values = warp_view(self.values, scalar)
         commands.append(p.record(kernels.scatter_kernel(scalar), dim, inputs, [values]))
-        if count := len(pattern.sliding_blocks):
+        count = len(pattern.sliding_blocks)
+        if count:
             projected = p.upload(pattern.sliding_blocks.astype(np.int32), int)
             planes = warp_view(p.coordinates.projections, wp.mat33d)
             inputs = [active, projected, planes, p.upload(solver.address, int)]

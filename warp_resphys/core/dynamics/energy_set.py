@@ -7,7 +7,7 @@ solution, so it is merged with inertia and target.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeVar, cast
@@ -35,6 +35,7 @@ from ..stepping.quantity import Quantity
 from ..stepping.state import Constants, ImplicitStage, Mass, State
 
 T = TypeVar("T")
+Named = TypeVar("Named", Quantity, Memory)
 # By name of a region or body: a material, or the materials of its regions.
 Materials = Mapping[str, Any]
 
@@ -64,6 +65,12 @@ def _without(prefix: str, values: Mapping[str, T]) -> Mapping[str, T]:
     if not prefix:
         return values
     return {name.removeprefix(prefix): x for name, x in values.items() if name.startswith(prefix)}
+
+
+def _prefixed(prefix: str, items: Iterable[Named]) -> dict[str, Named]:
+    """Returns items of an energy by their names in the simulator."""
+    renamed = (replace(item, name=f"{prefix}{item.name}") for item in items)
+    return {item.name: item for item in renamed}
 
 
 class EnergySet:
@@ -107,15 +114,14 @@ class EnergySet:
         self.parts: dict[str, tuple[str, ...]] = {}
         self.memory: dict[str, Memory] = {}
         for item in placed:
-            energy, prefix, points = item.energy, item.prefix, item.all_points or item.points
+            energy, prefix = item.energy, item.prefix
+            points = item.all_points or item.points
             bound = energy.bind(
                 EnergySite(item.body or body, item.first, points, rest_positions, method, time_step)
             )
             self._bound.append(bound)
-            parameters, inputs = (
-                {f"{prefix}{q.name}": replace(q, name=f"{prefix}{q.name}") for q in quantities}
-                for quantities in (energy.parameters, energy.inputs)
-            )
+            parameters = _prefixed(prefix, energy.parameters)
+            inputs = _prefixed(prefix, energy.inputs)
             if duplicates := {*parameters, *inputs} & {*self.parameters, *self.inputs}:
                 raise InputError(
                     f"two energies depend on {min(duplicates)}: "
@@ -128,21 +134,21 @@ class EnergySet:
                 self.counts[f"{prefix}{q.name}"] = energy.count_of(q)
                 if energy.names and energy.count_of(q) == energy.count:
                     self.parts[f"{prefix}{q.name}"] = energy.names
-            self.memory |= {
-                f"{prefix}{m.name}": replace(m, name=f"{prefix}{m.name}") for m in bound.memory
-            }
-        self._loading, self._stepping, self._posing, self._holding = (
-            [
-                k
-                for k, bound in enumerate(self._bound)
-                if getattr(type(bound), name) is not getattr(BoundEnergy, name)
-            ]
-            for name in ("load", "begin_step", "at_pose", "load_at_fixed")
-        )
+            self.memory |= _prefixed(prefix, bound.memory)
+        self._loading = self._overriding("load")
+        self._stepping = self._overriding("begin_step")
+        self._posing = self._overriding("at_pose")
+        self._holding = self._overriding("load_at_fixed")
         self._remembering = [k for k, bound in enumerate(self._bound) if bound.memory]
         self._rate_independent = [
             k for k, bound in enumerate(self._bound) if bound.rate_independent
         ]
+
+    def _overriding(self, name: str) -> list[int]:
+        """Returns the numbers of the energies that implement an optional method."""
+        inherited = getattr(BoundEnergy, name)
+        types = [type(bound) for bound in self._bound]
+        return [k for k, kind in enumerate(types) if getattr(kind, name) is not inherited]
 
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> tuple[list[Values], Mass]:
         """Returns the values of every energy that follow from the parameters,
@@ -152,11 +158,8 @@ class EnergySet:
         values: list[Values] = [
             bound.prepare(mine) for bound, mine in zip(self._bound, split, strict=True)
         ]
-        masses = [
-            mass
-            for bound, mine in zip(self._bound, split, strict=True)
-            if (mass := bound.mass(mine))
-        ]
+        by_energy = [bound.mass(mine) for bound, mine in zip(self._bound, split, strict=True)]
+        masses = [mass for mass in by_energy if mass]
         return values, masses[0] if len(masses) == 1 else Mass.sum(masses)
 
     def _values(
@@ -186,13 +189,19 @@ class EnergySet:
 
     def _step(self, step: SimulatorStep, k: int) -> EnergyStep:
         """Returns a step as energy k sees it."""
-        prefix, state, constants = self.placed[k].prefix, step.state, step.constants
+        prefix, state = self.placed[k].prefix, step.state
         if prefix and state.memory:
             state = replace(state, memory=_without(prefix, state.memory))
         fixed = None if prefix else step.inputs.fixed_positions
         inputs = _without(prefix, step.inputs.actuation)
         return EnergyStep(
-            state, step.stage, inputs, fixed, constants.values[k], constants.gravity, step.terms[k]
+            state,
+            step.stage,
+            inputs,
+            fixed,
+            step.constants.values[k],
+            step.constants.gravity,
+            step.terms[k],
         )
 
     def step_terms(self, step: SimulatorStep, near: torch.Tensor | None = None) -> StepTerms:
@@ -203,7 +212,8 @@ class EnergySet:
             near: (B, N, 3) positions of forces that depend on the pose (`internal_force`); without,
                 those without forces [m].
         """
-        batch, h, constants, stage = step.state.batch, step.stage.step, step.constants, step.stage
+        stage, constants = step.stage, step.constants
+        batch, h = step.state.batch, stage.step
         damping = constants.mass_damping[..., None] * h  # (1 or B, 1, 1)
         mass, force = constants.mass, self._loads(step, near)
         if step.inputs.attached_mass is not None:
@@ -267,7 +277,8 @@ class EnergySet:
 
     def _loads(self, step: SimulatorStep, near: torch.Tensor | None) -> torch.Tensor:
         """The dead loads (1 or B, N, 3): gravity, forces of inputs and those of energies [N]."""
-        constants, inputs, mass = step.constants, step.inputs, step.constants.load_mass
+        constants, inputs = step.constants, step.inputs
+        mass = constants.load_mass
         if inputs.attached_mass is not None:
             mass = mass + inputs.attached_mass
         force = mass[..., None] * constants.gravity[:, None]
@@ -420,7 +431,8 @@ def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEn
         declared = zip(cast(Sequence[Energy], body.energies), body.energy_points, strict=True)
         items += [(energy, points, prefix) for energy, points in declared]
         placed += [PlacedEnergy.of(whole, body, first, *item) for item in items]
-    if (contact := getattr(whole, "contact", None)) is not None:
+    contact = getattr(whole, "contact", None)
+    if contact is not None:
         placed.append(PlacedEnergy.of(whole, whole, 0, contact, contact.points(whole.mesh)))
     if whole.coordinates:
         dependent = one_part_each(whole.coordinates.points)

@@ -40,8 +40,7 @@ class EquationsOfMotion:
         time_step: h [s].
         integrator: name of the time integrator.
         settings: settings of the solver.
-        device: device of all tensors.
-        dtype: dtype of states.
+        tensors: ``device`` of all tensors and ``dtype`` of states, for torch's functions.
 
     Attributes:
         rest_positions: (N, 3) [m].
@@ -66,8 +65,7 @@ class EquationsOfMotion:
         time_step: float,
         integrator: str,
         settings: SolverSettings,
-        device: torch.device,
-        dtype: torch.dtype,
+        tensors: Mapping[str, Any],
     ) -> None:
         check_type("the body", body, Body)
         if not isinstance(time_step, SupportsFloat) or isinstance(time_step, str):
@@ -76,16 +74,18 @@ class EquationsOfMotion:
             )
         if not (np.isfinite(time_step) and time_step > 0.0):
             raise InputError(f"time_step is {time_step:g}: it must be positive, in seconds.")
-        if dtype not in (torch.float64, torch.float32):
-            raise InputError(f"dtype is {dtype}: choose torch.float64 or torch.float32.")
+        if tensors["dtype"] not in (torch.float64, torch.float32):
+            raise InputError(f"dtype is {tensors['dtype']}: choose torch.float64 or torch.float32.")
         if np.shape(gravity) != (3,) or not np.isfinite(gravity).all():
             raise InputError(
                 f"gravity is {gravity}: it must be three finite accelerations, in m/s^2."
             )
-        self.body, self.time_step, self.settings = body, time_step, settings
+        self.body = body
+        self.time_step = time_step
+        self.settings = settings
         self.method = make_integrator(integrator)
-        self.rest_positions = torch.as_tensor(body.vertices, device=device, dtype=dtype)
-        self.fixed = torch.as_tensor(body.fixed_vertices, device=device)
+        self.rest_positions = torch.as_tensor(body.vertices, **tensors)
+        self.fixed = torch.as_tensor(body.fixed_vertices, device=tensors["device"])
         self.coordinates = DeviceCoordinates(body.coordinates, self.rest_positions)
         placed = place_energies(body, material)
         _check_choices(body, placed, integrator, settings.name)
@@ -100,7 +100,7 @@ class EquationsOfMotion:
         sets = [points for item in placed for points in item.points]
         pattern = BlockPattern(body.vertices, eliminated, sets, body.coordinates.sliding)
         self._make_workspace = partial(
-            Workspace, placed, body.coordinates, self.fixed, pattern, device=device, dtype=dtype
+            Workspace, placed, body.coordinates, self.fixed, pattern, **tensors
         )
         # By thread, batch size and `is_shared`.
         self.workspaces: dict[tuple[int, int, bool], Workspace] = {}

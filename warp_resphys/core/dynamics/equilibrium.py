@@ -33,9 +33,8 @@ from .workspace import Workspace
 P = TypeVar("P")
 T = TypeVar("T")
 
-_REFINEMENTS = (
-    8  # iterations of an adjoint solve with a float32 factor before a float64 factor is used
-)
+# Iterations of an adjoint solve with a float32 factor before a float64 factor is used
+_REFINEMENTS = 8
 # Of the way of fixed vertices that bodies bar: a part of it, and their number.
 _LEAST_WAY, _MOST_PARTS = 1e-2, 32
 # Relative residuals: target, and limit if rounding prevents the target.
@@ -227,7 +226,8 @@ def reaction_of(
         gradient: (B, D + R, 3) of the energies at the held vertices, from `equilibrium` [N].
         loads: (B, N, 3) further loads on the held vertices, from `EnergySet.loads_at_fixed` [N].
     """
-    if not len(held := workspace.held):
+    held = workspace.held
+    if not len(held):
         return None
     force = terms.force if loads is None else terms.force + loads
     values = (terms.values[energy][name] for energy, name in workspace.potential.value_names)
@@ -254,7 +254,8 @@ def _exerted(workspace: Workspace, forces: torch.Tensor) -> torch.Tensor:
     """Returns what clamps and planes can exert of forces (B, D + R, 3):
     at vertices in planes the normal part.
     """
-    if not (coordinates := workspace.potential.coordinates).slides:
+    coordinates = workspace.potential.coordinates
+    if not coordinates.slides:
         return forces
     count = len(workspace.fixed)
     return torch.cat([forces[:, :count], coordinates.normal(forces[:, count:])], 1)
@@ -371,9 +372,10 @@ def _minimise(
         start = start.clone()
         start[:, fixed] = fixed_positions
     report = minimiser.solve(potential.improved_start(start).to(start), None if parts else follows)
-    work = {
-        name: sum(getattr(part, name) for part in [*parts, report])
-        for name in ("iterations", "factorisations")
+    solves = [*parts, report]
+    work: dict[str, Any] = {
+        "iterations": sum(part.iterations for part in solves),
+        "factorisations": sum(part.factorisations for part in solves),
     }
     gradient = potential.held_gradient[:, workspace.held]
     return potential.positions.to(start.dtype, copy=True), replace(report, **work), gradient
@@ -453,7 +455,8 @@ def _adjoint_solution(
 
     for hessian in hessians:
         hessian.refactor_exact()
-        z, rest, before = torch.zeros_like(right), right, size
+        z = torch.zeros_like(right)
+        rest, before = right, size
         for _ in range(1 if hessian.exact else 1 + _REFINEMENTS):
             z = z + solved(hessian, rest)
             product = potential.stiffness_product(z)

@@ -15,9 +15,8 @@ from ..stepping.rotations import closest_rotation, rotations
 
 # Largest displacement by a turn about a point inside, over the longest side of a body's box.
 _TURNED = 2.0 * 3.0**0.5
-_LEAST_TURN = (
-    1e-9  # weight of the identity in the rotation of a base, over the squared size of the body
-)
+# Weight of the identity in the rotation of a base, over the squared size of the body
+_LEAST_TURN = 1e-9
 _ITERATIONS = 8  # of the polar decomposition; enough for stretches from 0.1 to 10
 _AT_ONCE = 100  # states processed together
 
@@ -173,7 +172,8 @@ class BaseFrame:
     """
 
     def __init__(self, poses: torch.Tensor, time_step: float, first: int = 0) -> None:
-        self._poses, self._step, self._first = poses, time_step, first
+        self._poses = poses
+        self._step, self._first = time_step, first
         self._rotation = rotations(poses[..., 3:])
 
     def _at(self, step: int) -> tuple[torch.Tensor, torch.Tensor]:

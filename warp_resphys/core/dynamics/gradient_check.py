@@ -152,7 +152,9 @@ class _Problem:
     def __init__(
         self, simulator: Simulator, pose_name: str, steps: int, batch: int, seed: int, change: float
     ) -> None:
-        self.simulator, self.steps, self.batch, self.change = simulator, steps, batch, change
+        self.simulator = simulator
+        self.steps, self.batch = steps, batch
+        self.change = change
         self.random = torch.Generator().manual_seed(seed)
         self.state = pose(simulator, pose_name, batch)
         n = simulator.body.n_vertices
@@ -166,8 +168,10 @@ class _Problem:
                 for name, quantity in simulator.inputs.items()
             },
         )
-        h = simulator.time_step
-        self.weights = self.noise(steps + 1, batch, n, 3), h * self.noise(steps + 1, batch, n, 3)
+        self.weights = (
+            self.noise(steps + 1, batch, n, 3),
+            simulator.time_step * self.noise(steps + 1, batch, n, 3),
+        )
 
     def noise(self, *shape: int) -> torch.Tensor:
         return self.simulator.tensor(

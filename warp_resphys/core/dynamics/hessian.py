@@ -202,7 +202,9 @@ class ProjectiveHessian(HessianApproximation):
     def __init__(
         self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver
     ) -> None:
-        self._potential, self._pattern, self._linear = potential, pattern, linear
+        self._potential = potential
+        self._pattern = pattern
+        self._linear = linear
         self.vertex_at = pattern.free
         self._address = torch.as_tensor(
             linear.address[:, 0], device=potential.device, dtype=torch.int64
@@ -228,8 +230,7 @@ class ProjectiveHessian(HessianApproximation):
 
     @override
     def ready(self) -> bool:
-        terms = self._terms()
-        return self._key is not None and all(map(torch.equal, self._key, terms))
+        return self._key is not None and all(map(torch.equal, self._key, self._terms()))
 
     @override
     def refactor(

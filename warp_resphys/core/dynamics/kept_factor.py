@@ -145,12 +145,12 @@ class KeptFactor:
         linear: LinearSolver,
         corotation: Corotation,
     ) -> None:
-        self._potential, self._assembly, self._linear = potential, assembly, linear
+        self._potential = potential
+        self._assembly, self._linear = assembly, linear
         self._corotation = corotation
         self._factor: Factor | None = None
-        self._solutions = self._iterations = (
-            0  # with this factor, which counts as `_FACTOR` iterations
-        )
+        # With this factor, which counts as `_FACTOR` iterations.
+        self._solutions = self._iterations = 0
 
     def solve(self, rights: Sequence[torch.Tensor]) -> list[torch.Tensor] | None:
         """Returns solutions (B, N, 3) for right-hand sides,

@@ -41,17 +41,13 @@ class Linearisation:
     """
 
     def __init__(self, problem: TimeStep) -> None:
-        equations, self._workspace, self._terms = (
-            problem.equations,
-            problem.workspace,
-            problem.terms(),
-        )
+        equations = problem.equations
+        self._workspace = problem.workspace
+        self._terms = problem.terms()
         self._reaction = problem.reaction
-        self.stage, self.finish, self._name = (
-            problem.step.stage,
-            problem.finish,
-            equations.settings.linear_solver,
-        )
+        self.stage = problem.step.stage
+        self.finish = problem.finish
+        self._name = equations.settings.linear_solver
         self._fixed_positions, self._coordinates = problem.fixed_positions(), equations.coordinates
         self.start = self.hold(self.stage.target)
         self._potential = self._workspace.potential
@@ -116,7 +112,8 @@ class Linearisation:
                     columns = [
                         self._potential.restrict(column) for column in fields.double().unbind(3)
                     ]
-                    if (solutions := hessian.kept.solve(columns)) is not None:
+                    solutions = hessian.kept.solve(columns)
+                    if solutions is not None:
                         solution = torch.stack(solutions, 3).to(fields)
                 if solution is None:
                     hessian.refactor_exact()

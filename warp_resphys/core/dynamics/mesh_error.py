@@ -46,7 +46,8 @@ class CellCheck:
     """
 
     def __init__(self, body: Body, placed: Sequence[PlacedEnergy]) -> None:
-        self._body, self._placed, self._left = body, placed, _CHECKED
+        self._body, self._placed = body, placed
+        self._left = _CHECKED
 
     def __call__(self, q: torch.Tensor, values: Sequence[Values]) -> None:
         """Checks positions (B, N, 3) of equilibria [m], with values of every energy by name."""
@@ -90,7 +91,8 @@ def warn_of_cells(
         energies = sum(regions.values(), np.zeros(4))
         if not energies[0] > _LEAST**2 * energies[3]:
             continue
-        if abs(change := _change(energies)) < NOTICED:
+        change = _change(energies)
+        if abs(change) < NOTICED:
             continue
         simplex = member.mesh.element.is_simplex
         kind, order = (

@@ -120,7 +120,8 @@ class Minimiser:
         """Records the start of a solve, the choice of environments
         to factorise, and new directions.
         """
-        p, now, b = self._potential, self._now, self._potential.batch
+        p, now = self._potential, self._now
+        b = p.batch
         lbfgs = lbfgs_kernels(_scalar(self._right.dtype))
         right = warp_view(self._right, wp.vec3d if self._right.dtype == torch.float64 else wp.vec3f)
         vertex_at = p.upload(self.hessian.vertex_at.astype(np.int32), int)
@@ -161,7 +162,8 @@ class Minimiser:
         """Records the evaluation and the test of a trial,
         and the check whether a residual is rounding error.
         """
-        p, now, b, n = self._potential, self._now, self._potential.batch, self._potential.n_vertices
+        p, now = self._potential, self._now
+        b, n = p.batch, p.n_vertices
         inputs = [stores_pairs, self._tolerances, warp_view(p.inertia, wp.float64), now.evaluation]
         inputs.append(warp_view(self.hessian.clamped, wp.bool))
         outputs = [now.progress, now.search, now.pairs, now.history]

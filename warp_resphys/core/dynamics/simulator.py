@@ -114,25 +114,19 @@ class Simulator:
             else {"relative_tolerance": self.relative_tolerance}
         )
         self.settings = parse(SolverSettings, chosen, "solver").changed(**own)
-        where = (
+        self._equations = equations = EquationsOfMotion(
+            self.body,
+            self.material,
             self.gravity,
             self.time_step,
             self.integrator,
             self.settings,
-            self.device,
-            self.dtype,
+            {"device": self.device, "dtype": self.dtype},
         )
-        self._equations = equations = EquationsOfMotion(self.body, self.material, *where)
-        self.method, self.rest_positions, self.fixed = (
-            equations.method,
-            equations.rest_positions,
-            equations.fixed,
-        )
-        self.parameters, self.defaults, self.counts = (
-            equations.parameters,
-            equations.defaults,
-            equations.counts,
-        )
+        self.method = equations.method
+        self.rest_positions, self.fixed = equations.rest_positions, equations.fixed
+        self.parameters, self.defaults = equations.parameters, equations.defaults
+        self.counts = equations.counts
         self.energies = equations.energies
         self.inputs, self.parts = self.energies.inputs, self.energies.parts
         self._check_cells = CellCheck(self.body, self.energies.placed)

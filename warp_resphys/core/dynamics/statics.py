@@ -197,7 +197,8 @@ def _ramp_loads(solve: Solve, rest: torch.Tensor, limit: ConvergenceError | None
     """Returns the equilibrium (B, N, 3) reached by increasing the loads
     from zero in steps, or raises ``limit``.
     """
-    done, step, x = 0.0, 0.5, rest
+    done, step = 0.0, 0.5
+    x = rest
     while done < 1.0:
         share = min(done + step, 1.0)
         try:

@@ -16,9 +16,8 @@ from .equilibrium import equilibrium, reaction_of
 
 _MOST_SETTLINGS = 100
 _REMEDY = "the step does not settle: take a smaller time step or internal forces"
-_SETTLED = (
-    1e-10  # change of the positions, or of the gradient, relative to their size; or some roundings
-)
+# Change of the positions, or of the gradient, relative to their size; or some roundings
+_SETTLED = 1e-10
 
 
 class TimeStep:
@@ -64,7 +63,8 @@ class TimeStep:
 
     def finish(self, x: torch.Tensor) -> State:
         """Returns the new state from the solution x (B, N, 3) of the stage."""
-        step, equations, h = self.step, self.equations, self.equations.time_step
+        step, equations = self.step, self.equations
+        h = equations.time_step
         new = equations.method.finish(step.state, x, h)
         new = replace(new, memory=equations.energies.end_step(step, x, new.q))
         if step.stage.end == 1.0 or not len(equations.fixed):
@@ -128,7 +128,8 @@ class TimeStep:
             near: (B, N, 3) predicted positions at the end of the step [m]; None: an extrapolation
                 of the last steps.
         """
-        equations, workspace, state = self.equations, self.workspace, self.step.state
+        equations, workspace = self.equations, self.workspace
+        state = self.step.state
         start = (
             self.step.stage.target
             if near is None

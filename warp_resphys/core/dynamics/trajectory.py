@@ -119,9 +119,8 @@ class Motion:
         wanted = torch.as_tensor(times).to(self.markers)
         if len(self.q) == 1:
             return self.markers.expand(len(wanted), -1, -1, -1)
-        batch = self.q.shape[1]
         return sample(
-            self.markers.transpose(0, 1), wanted.expand(batch, -1), self.time_step
+            self.markers.transpose(0, 1), wanted.expand(self.q.shape[1], -1), self.time_step
         ).transpose(0, 1)
 
     def surface(self, environment: int = 0) -> ObstacleSurface:
@@ -264,9 +263,9 @@ class Motion:
             InputError: an unknown environment or another extension.
             DataFileError: the files cannot be written.
         """
-        q, v, markers = (
-            self.of_environment(values, environment) for values in (self.q, self.v, self.labelled)
-        )
+        q = self.of_environment(self.q, environment)
+        v = self.of_environment(self.v, environment)
+        markers = self.of_environment(self.labelled, environment)
         fields = dict[str, FloatArray]()
         if self.reaction is not None:
             held = self.reaction.vertices.cpu()

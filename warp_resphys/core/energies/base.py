@@ -313,9 +313,8 @@ class PlacedEnergy:
     energy: Energy
     points: tuple[Points, ...]  # points with operators on control vertices (`fem.coordinates`)
     prefix: str = ""
-    all_points: tuple[Points, ...] | None = (
-        None  # points with operators on all vertices; None if they are the same
-    )
+    # points with operators on all vertices; None if they are the same
+    all_points: tuple[Points, ...] | None = None
     body: Body | None = None  # body of the energy
     first: int = 0  # index of that body's first vertex in the simulator
 

@@ -163,7 +163,8 @@ def read_law(name: str) -> LawContent:
                 f"{path}: parameters.{key} is {value!r}: a law has a finite number there; "
                 "identify it again."
             )
-        if (unit := units.get(key, unit_of(key))) != unit_of(key):
+        unit = units.get(key, unit_of(key))
+        if unit != unit_of(key):
             raise DataFileError(
                 f"{path}: units.{key} is {unit!r}: a law has {unit_of(key)!r} there."
             )
@@ -188,8 +189,7 @@ def read_law(name: str) -> LawContent:
 
 def unit_of(name: str) -> str:
     """Unit of a parameter of a law."""
-    words = {*name.split("_")}
-    return next((unit for word, unit in _UNITS.items() if word in words), "Pa")
+    return next((unit for word, unit in _UNITS.items() if word in name.split("_")), "Pa")
 
 
 def share_outside_law(name: str, mesh: Mesh, positions: NDArray[np.float64]) -> float:

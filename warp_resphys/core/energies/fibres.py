@@ -18,7 +18,7 @@ from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, parameter
 from .base import Energy
 from .launcher import Launcher
-from .term import LawTerm, PartPoints, PointSet
+from .term import LawTerm, PartPoints, PointLaw, PointSet
 
 # Cosine between face normal and chamber axis above which a face is an end cap, without fibres.
 _CAP = 0.7
@@ -127,16 +127,8 @@ class Fibres(Energy):
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> LawTerm:
         shapes = {"fibre_stiffness": (self.count,)}
-        constants = [self.toe]
-        return LawTerm(
-            launcher,
-            sets,
-            THREAD,
-            shapes,
-            self.count,
-            constants=constants,
-            stiffness=lambda v: v["fibre_stiffness"],
-        )
+        law = PointLaw(THREAD, [self.toe], stiffness=lambda v: v["fibre_stiffness"])
+        return LawTerm(launcher, sets, law, shapes, self.count)
 
 
 def _long_axis(chamber: Chamber, mesh: Mesh, near: Sequence[float] | None) -> NDArray[np.float64]:

@@ -43,19 +43,19 @@ class DeformationPath(NamedTuple):
 
 def path_of(kind: str, strain: FloatArray) -> DeformationPath:
     """Returns the path of a kind of test at strains (N,)."""
-    x, one, zero = strain, np.ones_like(strain), np.zeros_like(strain)
     if kind == "shear":
-        root = np.sqrt(1.0 + 0.25 * x**2)
-        first = 0.5 * x + root
+        one, zero = np.ones_like(strain), np.zeros_like(strain)
+        root = np.sqrt(1.0 + 0.25 * strain**2)
+        first = 0.5 * strain + root
         slope = first / (2.0 * root)
         stretches, slopes = (first, one, 1.0 / first), (slope, zero, -slope / first**2)
-        green, by_x = np.zeros((2, len(x), 3, 3))
-        green[:, 0, 1] = green[:, 1, 0] = 0.5 * x
-        green[:, 1, 1] = 0.5 * x**2
+        green, by_x = np.zeros((2, len(strain), 3, 3))
+        green[:, 0, 1] = green[:, 1, 0] = 0.5 * strain
+        green[:, 1, 1] = 0.5 * strain**2
         by_x[:, 0, 1] = by_x[:, 1, 0] = 0.5
-        by_x[:, 1, 1] = x
+        by_x[:, 1, 1] = strain
         return DeformationPath(np.stack(stretches, 1), np.stack(slopes, 1), green, by_x, 1.0)
-    along, sign = (1.0 - x, -1.0) if kind == "compression" else (1.0 + x, 1.0)
+    along, sign = (1.0 - strain, -1.0) if kind == "compression" else (1.0 + strain, 1.0)
     powers = {"biaxial": (1.0, 1.0, -2.0), "planar": (1.0, 0.0, -1.0)}.get(kind, (1.0, -0.5, -0.5))
     s = np.stack([along**p for p in powers], 1)
     slope = sign * np.stack([p * along ** (p - 1.0) for p in powers], 1)
@@ -120,7 +120,8 @@ def bulk_of(parameters: Mapping[str, float], poissons_ratio: float) -> float:
 
 def _elastic(term: str, path: DeformationPath) -> FloatArray:
     s, slope = path.stretches, path.stretch_slopes
-    if ogden := re.fullmatch(r"ogden_(m?)(\d+)", term):
+    ogden = re.fullmatch(r"ogden_(m?)(\d+)", term)
+    if ogden:
         n = int(ogden[2]) * (-1 if ogden[1] else 1)
         return np.asarray((2.0 / n * s ** (n - 1) * slope).sum(1))
     power = int(term[1]) + int(term[2])  # of a (c10, c20, c30) or b (c01, c02)

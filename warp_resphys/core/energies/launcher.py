@@ -170,10 +170,7 @@ class Launcher:
         if not any(isinstance(command, HostLaunches) for command in commands):
             return self.capture_calls(lambda: issue(*commands), commands)
         groups = itertools.groupby(commands, lambda command: isinstance(command, HostLaunches))
-        parts = [
-            group if by_host else [self.capture(*group)]
-            for by_host, group in ((k, list(g)) for k, g in groups)
-        ]
+        parts = [list(group) if by_host else [self.capture(*group)] for by_host, group in groups]
         return LaunchSequence(*itertools.chain(*parts))
 
     def capture_calls(self, calls: Callable[[], None], commands: Iterable[Any]) -> "CapturedGraph":

@@ -137,7 +137,8 @@ class Material(ABC):
     @classmethod
     def _arguments(cls, parameters: Mapping[str, Any]) -> dict[str, Any]:
         """Returns the arguments of the class: parameters, and the items of groups."""
-        known_quantities, values, groups = cls.unnumbered(), dict(parameters), {}
+        known_quantities = cls.unnumbered()
+        values, groups = dict(parameters), {}
         for group, quantities in cls.groups.items():
             names = {q.name for q in quantities}
             present = {name for name in parameters if re.sub(r"_[1-9]\d*$", "", name) in names}

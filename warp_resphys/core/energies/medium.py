@@ -59,9 +59,8 @@ class Medium(Energy):
     tangential: Parameter = parameter(0.0, "drag_tangential", "", closed=True)
     layer: Parameter = parameter(0.0, "added_layer", "m", closed=True)
     buoyancy: bool = True  # whether buoyancy acts
-    faces: NDArray[np.int64] | None = (
-        None  # (F, n) faces, among `boundary_faces`, that the medium acts on; None: all
-    )
+    # (F, n) faces, among `boundary_faces`, that the medium acts on; None: all
+    faces: NDArray[np.int64] | None = None
 
     @override
     def points(self, mesh: Mesh) -> tuple[FacePoints, ...]:
@@ -106,7 +105,8 @@ class BoundMedium(BoundEnergy):
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         """Returns values with the areas and normals of the start of the step."""
-        h, batch, stage = step.stage.step, step.state.batch, step.stage
+        stage = step.stage
+        h, batch = stage.step, step.state.batch
         tangents = torch.einsum("qkd,bfki->bfqdi", self._slopes, step.state.q[:, self._nodes])
         area = torch.linalg.cross(tangents[..., 0, :], tangents[..., 1, :]) * self._weights[:, None]
         names = ("medium_density", "drag_linear", "drag_normal", "drag_tangential", "added_layer")

@@ -28,10 +28,11 @@ from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity, parameter
 from .base import Energy
 from .launcher import Launcher
-from .term import LawTerm, PartPoints, PointSet
+from .term import LawTerm, PartPoints, PointLaw, PointSet
 
 STRESS = Quantity(
-    *("muscle_stress", "Pa"),
+    "muscle_stress",
+    "Pa",
     per="muscle",
     typical=1e4,
     words="stress",
@@ -39,7 +40,8 @@ STRESS = Quantity(
     shown_factor=1e-3,
 )
 CONTRACTION = Quantity(
-    *("muscle_contraction", ""),
+    "muscle_contraction",
+    "",
     per="muscle",
     typical=0.05,
     words="contraction",
@@ -143,7 +145,8 @@ class Muscles(Energy):
             InputError: a cell that the mesh does not have.
         """
         points, weights = mesh.element.rule
-        nodes, operators, volumes, numbers = [], [], [], []
+        nodes, operators = [], []
+        volumes, numbers = [], []
         for number, (name, muscle) in enumerate(zip(self.names, self.muscles, strict=True)):
             cells = np.asarray(muscle.cells, dtype=np.int64)
             wrong = cells[(cells < 0) | (cells >= len(mesh.cells))]
@@ -188,6 +191,5 @@ class Muscles(Energy):
         def stiffness(values: Mapping[str, torch.Tensor]) -> torch.Tensor:
             return values["muscle_stress"].clamp_min(0.0) + values["muscle_stiffness"]
 
-        return LawTerm(
-            launcher, sets, MUSCLE, shapes, self.count, constants=[self.toe], stiffness=stiffness
-        )
+        law = PointLaw(MUSCLE, [self.toe], stiffness)
+        return LawTerm(launcher, sets, law, shapes, self.count)

@@ -30,7 +30,7 @@ from ..fem.integration_points import Points, physical_gradients
 from ..mesh.volume_mesh import Mesh
 from .base import Energy
 from .launcher import Launcher
-from .term import LawTerm, PartPoints, PointSet
+from .term import LawTerm, PartPoints, PointLaw, PointSet
 
 
 class PointwiseEnergy(Energy):
@@ -79,7 +79,7 @@ class PointwiseTerm(LawTerm):
         shapes: dict[str, tuple[int, ...]] = {
             name: arrays.get(name, (energy.count,)) for name in names
         }
-        super().__init__(launcher, sets, law, shapes, energy.count, list(arrays))
+        super().__init__(launcher, sets, PointLaw(law), shapes, energy.count, list(arrays))
 
 
 def one_part_each(points: Points) -> PartPoints:

@@ -135,9 +135,8 @@ class IncrementalPotential(Launcher):
         self.residual, self.held_gradient = self.zeros(n_vertices, 3), self.zeros(n_vertices, 3)
         self._point_energy = self.zeros(self._n_points)
         self._vertex_energy = self.zeros(n_vertices)
-        self.energy, self.energy_size, self.balance, self.residual_norm = (
-            self.zeros() for _ in range(4)
-        )
+        self.energy, self.energy_size = self.zeros(), self.zeros()
+        self.balance, self.residual_norm = self.zeros(), self.zeros()
         self._record_evaluation()
         self._tangents: list[torch.Tensor] = []
         self.tangent_active, self.clamp = (
@@ -145,9 +144,8 @@ class IncrementalPotential(Launcher):
         )
         self.all_active = True
         self.low_rank: torch.Tensor | None = None
-        self._stiff_columns: torch.Tensor | None = (
-            None  # the same, with components normal to symmetry planes
-        )
+        # The same, with components normal to symmetry planes
+        self._stiff_columns: torch.Tensor | None = None
         self._direction = self.zeros(n_vertices, 3)
         self._adjoints: list[Callable[[], dict[str, torch.Tensor]]] = []
 
@@ -233,13 +231,15 @@ class IncrementalPotential(Launcher):
         )
         for term, values in zip(self.energies, terms.values, strict=True):
             for name, buffer in term.values.items():
-                if (value := values[name]) is not None:
+                value = values[name]
+                if value is not None:
                     buffer.copy_(value.detach())
         for positions, moved in self._feasible[1:]:
             self._feasible[0][0][:, moved] = positions[:, moved]
         for term in self.energies:
             term.set_step()
-        totals = [total for term in self.energies if (total := term.total_stiffness()) is not None]
+        stiffnesses = [term.total_stiffness() for term in self.energies]
+        totals = [stiffness for stiffness in stiffnesses if stiffness is not None]
         if totals:
             self.stiffness.copy_(totals[0] if len(totals) == 1 else torch.stack(totals).sum(0))
 
@@ -337,7 +337,8 @@ class IncrementalPotential(Launcher):
         Raises:
             InputError: less is free.
         """
-        if (feasible := self.feasible) is None:
+        feasible = self.feasible
+        if feasible is None:
             return True
         origin = feasible.clone()
         feasible[:, fixed] = places.to(feasible)
@@ -422,7 +423,8 @@ class IncrementalPotential(Launcher):
         self._product.zero_()
         self.launch(self._product_commands)
         product = self._product.clone()
-        if (columns := self._stiff_columns) is not None:
+        columns = self._stiff_columns
+        if columns is not None:
             along = torch.einsum("bnr,bn->br", columns, self._direction.flatten(1))
             product += torch.einsum("bnr,br->bn", columns, along).view_as(product)
         if self.last_pair_tangents:

@@ -31,10 +31,11 @@ from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Quantity
 from .base import BoundEnergy, Energy, EnergySite
 from .launcher import Launcher
-from .term import LawTerm, PartPoints, PointSet, Values, value_of
+from .term import LawTerm, PartPoints, PointLaw, PointSet, Values, value_of
 
 PRESSURE = Quantity(
-    *("pressure", "Pa"),
+    "pressure",
+    "Pa",
     per="chamber",
     typical=1e4,
     words="pressure",
@@ -131,7 +132,7 @@ class Pressure(Energy):
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> LawTerm:
         shapes = {"pressure": (self.count,), "apex": (self.count, 3)}
-        return LawTerm(launcher, sets, PRESSURE_LAW, shapes, self.count)
+        return LawTerm(launcher, sets, PointLaw(PRESSURE_LAW), shapes, self.count)
 
 
 class BoundPressure(BoundEnergy):
@@ -163,14 +164,9 @@ class BoundPressure(BoundEnergy):
                 points.weights.reshape(shape)[touching],
             )
         )
-        self._nodes, self._part, self._at_edge = (
-            torch.as_tensor(values, device=device)
-            for values in (
-                points.nodes[touching],
-                points.part.reshape(shape)[touching],
-                at_edge[touching],
-            )
-        )
+        self._nodes = torch.as_tensor(points.nodes[touching], device=device)
+        self._part = torch.as_tensor(points.part.reshape(shape)[touching], device=device)
+        self._at_edge = torch.as_tensor(at_edge[touching], device=device)
 
     @override
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
@@ -188,7 +184,8 @@ class BoundPressure(BoundEnergy):
         if not len(self._nodes):
             return None
         f = torch.einsum("cqkw,bcki->bcqiw", self._operators, q[:, self._nodes].double())
-        x, t1, t2 = f[..., 0] - self._apex[self._part], f[..., 1], f[..., 2]
+        x = f[..., 0] - self._apex[self._part]
+        t1, t2 = f[..., 1], f[..., 2]
         columns = (
             2.0 * torch.linalg.cross(t1, t2),
             torch.linalg.cross(x, t2),
@@ -214,7 +211,8 @@ def _apex(chamber: Chamber, body: Body) -> FloatArray:
     Raises:
         MeshError: see `check_open_faces`; or two of the planes are parallel.
     """
-    if not len(edges := chamber.edges):
+    edges = chamber.edges
+    if not len(edges):
         return np.zeros(3)
     sliding = [plane.contains(body.vertices[edges]).all(axis=1) for plane in body.symmetry]
     fixed = np.isin(edges, body.fixed_vertices).all(axis=1)

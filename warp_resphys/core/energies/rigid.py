@@ -36,7 +36,7 @@ from .launcher import Launcher
 from .materials import Corotated
 from .pointwise import one_part_each
 from .solid import VISCOUS, SolidTerm
-from .term import LawTerm, PartPoints, PointSet
+from .term import LawTerm, PartPoints, PointLaw, PointSet
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ class PointInertia(_OnOwnPoints):
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> LawTerm:
         count = self.part_points.n_points
         shapes = {"target": (count, 3), "inertia": (count,)}
-        return LawTerm(launcher, sets, INERTIA, shapes, count, stiffness=lambda v: v["inertia"])
+        law = PointLaw(INERTIA, stiffness=lambda v: v["inertia"])
+        return LawTerm(launcher, sets, law, shapes, count)
 
     @override
     def bind(self, site: EnergySite) -> "BoundInertia":
@@ -97,8 +98,7 @@ class BoundRigidInertia(BoundInertia):
 
     def __init__(self, part: RigidInertia, site: EnergySite) -> None:
         super().__init__(part, site)
-        like = site.rest_positions
-        self._controls = torch.as_tensor(site.points[0].nodes[0], device=like.device)
+        self._controls = torch.as_tensor(site.points[0].nodes[0], device=site.rest_positions.device)
         self._factor = site.tensor(part.part_points.gradients[0, :, :, 0])  # (P, 4) L^T
         volume = site.load_volume[:, part.cells].sum(axis=1)
         self._volume = site.tensor(volume)  # (N,) volume whose weight acts at each vertex [m^3]

@@ -26,7 +26,8 @@ def silicone_name(product: str) -> str:
         ValueError: it has no law here.
     """
     known = {_letters(name): name for name in silicone_files()}
-    if (wanted := _letters(product)) not in known:
+    wanted = _letters(product)
+    if wanted not in known:
         near = (
             did_you_mean(product, [*known.values()])
             or f": choose from {', '.join(known.values())}."

@@ -227,7 +227,8 @@ class BoundSolid(BoundEnergy):
         return Mass(inertia, weight, parameters["mass_damping"])
 
     def _viscosity(self, values: Values) -> Viscosity:
-        damping, ratio, time = (values[name] for name in ("damping", "prony_ratio", "prony_time"))
+        damping = values["damping"]
+        ratio, time = values["prony_ratio"], values["prony_time"]
         zero = self.site.rest_positions.new_zeros(1, 2)
         return Viscosity(zero if damping is None else damping, damping is not None, ratio, time)
 
@@ -296,7 +297,8 @@ class SolidTerm(StrainTerm):
 
     @override
     def step(self, s: PointSet, positions: Any) -> Kernel:
-        if (cells := self.lane_cells(s)) is None:
+        cells = self.lane_cells(s)
+        if cells is None:
             return super().step(s, positions)
         return Kernel(
             lanes.cell_step(self._law), [*self._arguments(s, positions), cells], by_cells=True
@@ -304,7 +306,8 @@ class SolidTerm(StrainTerm):
 
     @override
     def tangent(self, s: PointSet, positions: Any) -> Kernel:
-        if (cells := self.lane_cells(s)) is None:
+        cells = self.lane_cells(s)
+        if cells is None:
             return super().tangent(s, positions)
         return Kernel(
             lanes.cell_tangent(self._law), [*self._arguments(s, positions), cells], by_cells=True
@@ -329,7 +332,8 @@ class SolidTerm(StrainTerm):
         count = int(np.argmax(with_volume)) if with_volume.any() else s.points_per_cell
         if count < 2:
             return None
-        gradients, width, nodes = s.source.gradients, lanes.WIDTH, s.nodes_per_cell
+        gradients = s.source.gradients
+        width, nodes = lanes.WIDTH, s.nodes_per_cell
         groups = -(-count // width)
         chosen = np.minimum(np.arange(groups * width), count - 1)
         # (C, Q, K, 3) to (C, G, K, 3, points of a group)

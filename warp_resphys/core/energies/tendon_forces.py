@@ -42,14 +42,15 @@ from typing_extensions import override
 from ...kernels import tendon_segments as kernels
 from ..stepping.quantity import Quantity
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
-from .launcher import Launcher, launch, warp_view
+from .launcher import Launcher, launch, struct_of, warp_view
 from .term import Adjoint, Kernel, PartPoints, PartTerm, PointSet, Values, value_of
 
 TENSION = Quantity(
     "tendon_tension", "N", 0.0, closed=True, per="tendon", words="tension", shown_unit="N"
 )
 CONTRACTION = Quantity(
-    *("tendon_contraction", "m"),
+    "tendon_contraction",
+    "m",
     per="tendon",
     typical=1e-3,
     words="contraction",
@@ -61,9 +62,8 @@ OFFSETS = tuple(Quantity(f"tendon_offset_{k}", "m", per="tendon", typical=1e-3) 
 FRICTION = Quantity("tendon_friction", "", 0.0, closed=True, per="tendon")
 BRISTLE = Quantity("tendon_bristle_length", "m", 0.0, per="tendon")
 SEGMENT_TENSION = "tendon_segment_tension"
-ROUTE = (
-    "tendon_route"  # (B, T, 3) c of `kernels.tendon_segments`: one, and the offsets in their unit
-)
+# (B, T, 3) c of `kernels.tendon_segments`: one, and the offsets in their unit
+ROUTE = "tendon_route"
 # (B, P) of the guide before each segment: friction at the start of a step, its bounds downwards and
 # upwards [N], and length of the tendon beyond it then [m]
 STEP_VALUES = ("tendon_hold", "tendon_drop", "tendon_rise", "tendon_beyond")
@@ -199,7 +199,8 @@ class BoundTendons(BoundEnergy):
         super().__init__(tendons, site)
         (points,) = site.points
         assert isinstance(points, TendonPoints)
-        part, device, count = points.part, site.rest_positions.device, tendons.count
+        part, count = points.part, tendons.count
+        device = site.rest_positions.device
         self._lines = TendonLines(points, count, toe, site.rest_positions)
         first = np.searchsorted(part, np.arange(count + 1))
         self._runs = Launcher(1, device).upload(first.astype(np.int32), int)
@@ -339,11 +340,18 @@ class TendonTerm(PartTerm):
         self._lines = TendonLines(s.source, count, toe, self.weight)
         self._toe = wp.float64(toe)
         first = np.searchsorted(s.source.part, np.arange(count + 1)).astype(np.int32)
-        self._first = launcher.upload(first, int)
-        self._rest = launcher.upload(s.source.rest, wp.mat33d)
-        self._anchors = launcher.upload(s.source.anchors, wp.mat33d)
+        self._segments = struct_of(
+            kernels.Segments,
+            anchors=launcher.upload(s.source.anchors, wp.mat33d),
+            rest=launcher.upload(s.source.rest, wp.mat33d),
+            tendon=self.part,
+            first=launcher.upload(first, int),
+        )
         self._tension = launcher.zeros(s.n_points)
         self._spring, self._friction = launcher.zeros(count, 3), launcher.zeros(s.n_points, 3)
+        self._pulls = struct_of(
+            kernels.Pulls, tension=self._tension, spring=self._spring, friction=self._friction
+        )
         self._segment_length = torch.as_tensor(
             np.linalg.norm(s.source.rest[..., 0], axis=1), device=launcher.device
         )
@@ -360,49 +368,47 @@ class TendonTerm(PartTerm):
     @override
     def before(self, positions: Any, active: Any) -> list[Any]:
         (s,) = self.sets
-        route = self.view(ROUTE, wp.vec3d)
-        scalars = [self.view(q.name) for q in (TENSION, CONTRACTION, STIFFNESS)]
         if self._rubs:
-            friction = [self.values[name] for name in (*STEP_VALUES, BRISTLE.name)]
+            guides = {name.removeprefix("tendon_"): self.values[name] for name in STEP_VALUES}
+            bristles = self.values[BRISTLE.name]
         else:
-            friction = [
-                *(self.launcher.zeros(s.n_points),) * 4,
-                self.launcher.zeros(self.count) + 1.0,
-            ]
+            guides = dict.fromkeys(
+                ("hold", "drop", "rise", "beyond"), self.launcher.zeros(s.n_points)
+            )
+            bristles = self.launcher.zeros(self.count) + 1.0
+        friction = struct_of(kernels.GuideFriction, **guides, bristles=bristles)
         inputs = [
             active,
             s.points,
-            self._anchors,
-            self._first,
-            self._rest,
+            self._segments,
             self._toe,
-            route,
-            *scalars,
+            self._tendon_values(),
+            friction,
+            positions,
         ]
-        inputs += [*(warp_view(value, wp.float64) for value in friction), positions]
-        outputs = [warp_view(self._tension, wp.float64), *self._changes]
         return [
-            self.launcher.record(kernels.pull, (self.launcher.batch, self.count), inputs, outputs)
+            self.launcher.record(
+                kernels.pull, (self.launcher.batch, self.count), inputs, [self._pulls]
+            )
         ]
 
-    @property
-    def _changes(self) -> list[Any]:
-        """Energy, change and slope of springs and of friction."""
-        return [warp_view(buffer, wp.vec3d) for buffer in (self._spring, self._friction)]
+    def _tendon_values(self) -> Any:
+        return struct_of(
+            kernels.TendonValues,
+            route=self.values[ROUTE],
+            commanded=self.values[TENSION.name],
+            contraction=self.values[CONTRACTION.name],
+            stiffness=self.values[STIFFNESS.name],
+        )
 
     @override
     def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
-        route = self.view(ROUTE, wp.vec3d)
-        scalars = (self.values[TENSION.name], self.values[STIFFNESS.name], self._tension)
-        views = [route, *(warp_view(x, wp.float64) for x in scalars), *self._changes]
-        return [s.points, self._anchors, self._first, self.part, *views, positions]
+        return [s.points, self._segments, self._tendon_values(), self._pulls, positions]
 
     @override
     def tangent(self, s: PointSet, positions: Any) -> Kernel:
         route, tension = self.view(ROUTE, wp.vec3d), warp_view(self._tension, wp.float64)
-        return Kernel(
-            kernels.tangent, [s.points, self._anchors, self.part, route, tension, positions]
-        )
+        return Kernel(kernels.tangent, [s.points, self._segments, route, tension, positions])
 
     @override
     def low_rank(self, positions: Any) -> torch.Tensor | None:
@@ -435,7 +441,7 @@ class TendonTerm(PartTerm):
         columns = self.values[ROUTE].square().sum(-1)
         stretching = (tension * columns)[:, self.part_of] / self._segment_length
         if self._rubs:  # A guide's slope is at most the sum of its bounds over the bristle length.
-            _, drop, rise, _ = (self.values[name] for name in STEP_VALUES)
+            drop, rise = self.values["tendon_drop"], self.values["tendon_rise"]
             beyond = self._lines.beyond
             slopes = (drop + rise) / self.values[BRISTLE.name][:, self.part_of] * beyond.sum(0)
             stretching = stretching + columns[:, self.part_of] * (slopes @ beyond.mT)

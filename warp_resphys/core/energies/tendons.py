@@ -81,9 +81,8 @@ class Tendons(Energy):
     stiffness: Parameter = 0.0
     toe: float = 1e-4  # elongation at which the spring reaches its full stiffness [m]
     reach: float = 1e-3  # largest distance of a guide from the body [m]
-    friction: Parameter | None = (
-        None  # coefficient mu in the guides, parameter ``tendon_friction``; None: no friction
-    )
+    # coefficient mu in the guides, parameter ``tendon_friction``; None: no friction
+    friction: Parameter | None = None
     bristle_length: Parameter = 1e-4  # slide over which friction reverses [m]
 
     def __post_init__(self) -> None:
@@ -222,7 +221,9 @@ class Tendons(Energy):
         Raises:
             InputError: a guide outside of the body.
         """
-        nodes, operators, tendon, rest, anchors = [], [], [], [], []
+        nodes, operators = [], []
+        tendon = []
+        rest, anchors = [], []
         for number, (route, in_world, directions) in enumerate(self._lines):
             # Those in the world have no place.
             places = locate(mesh, np.where(in_world[:, None], route[~in_world][:1], route))

@@ -68,12 +68,8 @@ class PointSet:
     def __init__(
         self, launcher: Launcher, points: Points, n_vertices: int, in_body: slice, in_energy: slice
     ) -> None:
-        self.source, self.in_body, self.in_energy, self.n_points = (
-            points,
-            in_body,
-            in_energy,
-            points.n_points,
-        )
+        self.source, self.n_points = points, points.n_points
+        self.in_body, self.in_energy = in_body, in_energy
         self.n_vertices, self.device = n_vertices, launcher.device
         self.cells, self.points_per_cell, self.nodes_per_cell, self.width = points.gradients.shape
         vertex = points.nodes.ravel()
@@ -187,7 +183,8 @@ class Term(ABC):
             positions: (B, N, 3) buffer of x [m].
             direction: (B, N, 3) buffer of z [m].
         """
-        batch, outputs, commands = self.launcher, self._slopes(), []
+        batch, outputs = self.launcher, self._slopes()
+        commands = []
         out = {o.name: batch.zeros(*o.shape) for o in outputs}
         x, z = (warp_view(field, wp.vec3d) for field in (positions, direction))
         for s in self.sets:
@@ -333,37 +330,49 @@ class PartTerm(Term):
         return torch.eye(self.count, device=self.launcher.device, dtype=torch.float64)[self.part_of]
 
 
-class LawTerm(PartTerm):
-    """A term whose points follow a law of any number of values (``kernels.laws``).
+class PointLaw(NamedTuple):
+    """A law of points with what does not change.
 
-    Args:
-        launcher: launcher of the potential.
-        sets: one set of points.
+    Attributes:
         law: energy of a point as a function of the values.
-        shapes: shapes of the values in the order of the vector: (count,) or (count, n) for one or n
-            values per part.
-        count: number of parts.
-        arrays: names of arrays, of any shape, that every point reads completely.
         constants: numbers that are the last values at every point.
         stiffness: returns an upper bound (B, count) of the eigenvalues of a point of weight one
             from the values; zero if omitted: the constant matrix of projective dynamics does not
             contain the energy.
     """
 
+    law: Law
+    constants: Sequence[float] = ()
+    stiffness: Callable[[Mapping[str, torch.Tensor]], torch.Tensor] | None = None
+
+
+class LawTerm(PartTerm):
+    """A term whose points follow a law of any number of values (``kernels.laws``).
+
+    Args:
+        launcher: launcher of the potential.
+        sets: one set of points.
+        point_law: law of the points.
+        shapes: shapes of the values in the order of the vector: (count,) or (count, n) for one or n
+            values per part.
+        count: number of parts.
+        arrays: names of arrays, of any shape, that every point reads completely.
+    """
+
     def __init__(
         self,
         launcher: Launcher,
         sets: Sequence[PointSet],
-        law: Law,
+        point_law: PointLaw,
         shapes: Shapes,
         count: int,
         arrays: Sequence[str] = (),
-        constants: Sequence[float] = (),
-        stiffness: Callable[[Mapping[str, torch.Tensor]], torch.Tensor] | None = None,
     ) -> None:
         super().__init__(launcher, sets, shapes, count)
-        self._kernels, self._law, self._shapes = point_kernels(law), law, dict(shapes)
-        self._arrays, self._stiffness = frozenset(arrays), stiffness
+        self._law, self._stiffness = point_law.law, point_law.stiffness
+        self._kernels = point_kernels(self._law)
+        constants = point_law.constants
+        self._shapes, self._arrays = dict(shapes), frozenset(arrays)
         self._constants = launcher.zeros(len(constants)) + torch.tensor(
             constants, device=launcher.device, dtype=torch.float64
         )

@@ -66,9 +66,8 @@ class PointMass:
 
     mass: float  # [kg]
     vertices: Sequence[int]  # (n,) vertices that carry the weight
-    weights: Sequence[float] | None = (
-        None  # (n,) share of each vertex, summing to one; equal shares if omitted
-    )
+    # (n,) share of each vertex, summing to one; equal shares if omitted
+    weights: Sequence[float] | None = None
 
     def per_vertex(self, n_vertices: int) -> NDArray[np.float64]:
         """Returns the mass at each vertex, (N,) [kg].
@@ -114,9 +113,8 @@ class Body:
     # ``per_vertex`` gives every vertex the density times the mean element volume: wrong by a factor
     # of two on the published beam, and meant only for comparison with the published code
     mass: str = "row_sum"
-    volume_integration: str = (
-        "centre"  # ``centre`` or ``full`` (see `integration_points.discretise`)
-    )
+    # ``centre`` or ``full`` (see `integration_points.discretise`)
+    volume_integration: str = "centre"
     point_masses: Sequence[PointMass] = field(default=())  # attached weights
     energies: Sequence[BodyEnergy] = field(default=())  # besides the material: pressure, fibres
     rigid: Mapping[str, Rigid] = field(default_factory=dict)  # rigid parts, by region of the mesh
@@ -336,7 +334,8 @@ class Body:
         if part not in named:
             known = f"choose one of {', '.join(named)}" if named else "its mesh has no regions"
             raise InputError(f"the body has no region {part!r}: {known}.")
-        if not len(found := np.intersect1d(self.fixed_vertices, named[part])):
+        found = np.intersect1d(self.fixed_vertices, named[part])
+        if not len(found):
             raise InputError(f"no vertex of {part!r} is fixed: fix some, or choose another region.")
         return found
 
@@ -411,9 +410,10 @@ class Body:
                     f"{n_fixed} of the {len(vertices)} vertices of the rigid part {name!r} are "
                     "fixed: fix all of them, or none."
                 )
-            if other := next(
+            other = next(
                 (part_of_vertex[i] for i in vertices.tolist() if i in part_of_vertex), None
-            ):
+            )
+            if other:
                 raise InputError(
                     f"the rigid parts {other!r} and {name!r} share vertices: make them one region."
                 )

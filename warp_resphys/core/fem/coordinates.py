@@ -137,17 +137,15 @@ class Coordinates:
     def joined(cls, maps: "Sequence[Coordinates]") -> "Coordinates":
         """Returns the map of several bodies with their vertices concatenated."""
         first = np.cumsum([0, *(part.n_vertices for part in maps)])
-        dependent, sliding = (
-            np.concatenate(
-                [getattr(part, name) + start for part, start in zip(maps, first, strict=False)]
-            )
-            for name in ("dependent", "sliding")
+        moved = [*zip(maps, first, strict=False)]
+        return cls(
+            int(first[-1]),
+            np.concatenate([part.dependent + start for part, start in moved]),
+            scipy.sparse.csr_array(scipy.sparse.block_diag([part.weights for part in maps])),
+            np.concatenate([part.sliding + start for part, start in moved]),
+            np.concatenate([part.projections for part in maps]),
+            np.concatenate([part.offsets for part in maps]),
         )
-        weights = scipy.sparse.csr_array(scipy.sparse.block_diag([part.weights for part in maps]))
-        projections, offsets = (
-            np.concatenate([getattr(part, n) for part in maps]) for n in ("projections", "offsets")
-        )
-        return cls(int(first[-1]), dependent, weights, sliding, projections, offsets)
 
     def with_planes(
         self, planes: Sequence[SymmetryPlane], vertices: FloatArray, fixed: IntArray
@@ -347,7 +345,8 @@ def control_vertices(
             planes.
     """
     places = vertices[candidates]
-    inside = [flags for plane in planes if (flags := plane.contains(places)).any()]
+    in_planes = [plane.contains(places) for plane in planes]
+    inside = [flags for flags in in_planes if flags.any()]
     size = float(np.linalg.norm(np.ptp(places, axis=0)))
     chosen: list[int] = []
     for allowed in _corner_sets(inside, len(candidates)):

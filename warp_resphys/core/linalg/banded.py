@@ -262,7 +262,8 @@ class _Bordered(Factor):
         if idle is not None and before is not None:
             cross = torch.where(idle[:, None, None], before.cross, cross)
             corner = torch.where(idle[:, None, None], before.corner, corner)
-        self.solver, self.inner, self.cross, self.corner = solver, inner, cross, corner
+        self.solver, self.inner = solver, inner
+        self.cross, self.corner = cross, corner
         self.solved = inner.solve(cross)  # (B, n - m, m) A^-1 B^T
         schur = corner - cross.mT @ self.solved
         self._schur, info = torch.linalg.cholesky_ex(schur.nan_to_num(posinf=0.0, neginf=0.0))

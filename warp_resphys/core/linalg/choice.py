@@ -32,9 +32,8 @@ from .solver_names import LinearSolverName
 from .tiled import TiledSolver
 
 LINEAR_SOLVERS: tuple[LinearSolverName, ...] = get_args(LinearSolverName)
-MAX_BANDED_FLOPS = (
-    4e10  # multiplications of a banded factor on a CPU above which CHOLMOD is cheaper
-)
+# Multiplications of a banded factor on a CPU above which CHOLMOD is cheaper
+MAX_BANDED_FLOPS = 4e10
 MAX_SMALL_FLOPS = 5e8  # multiplications of a banded factor up to which no other one is cheaper
 COMPACT = 30  # squared bandwidth over unknowns from which Pardiso is cheaper than a banded factor
 BORDER_FLOPS = 44  # of an unknown beside a band, in multiplications of a banded factor
@@ -97,7 +96,8 @@ def _cheapest(
         return DenseSolver if unknowns <= MAX_DENSE_UNKNOWNS else SparseSolver
     kind: type[LinearSolver] = BandedSolver
     cost = unknowns * width**2
-    if len(border := hubs(rows, cols, n_nodes)):
+    border = hubs(rows, cols, n_nodes)
+    if len(border):
         rest = block * bandwidth(
             *banded_rest(rows, cols, n_nodes, border)[:2], n_nodes - len(border)
         )

@@ -27,7 +27,8 @@ Array = NDArray[np.float64]
 Objective = Callable[[Array, bool], tuple[float, Array, Array]]
 Move = Callable[[torch.Tensor], torch.Tensor]
 
-_DECREASE, _INCREASE, _MAX_DAMPING = 0.1, 10.0, 1e12
+_DECREASE, _INCREASE = 0.1, 10.0
+_MAX_DAMPING = 1e12
 _MARQUARDT = 1e-2  # a damping of one adds this fraction of a diagonal entry to it
 # Fraction of the trace added to the diagonal, against motion in directions without influence.
 _RIDGE = 1e-10
@@ -48,9 +49,8 @@ class Point:
 class Problem(ABC):
     """A batch of independent sums of squares."""
 
-    follows_valleys = (
-        False  # whether a rejected step may be followed by a second one; of a batch of one
-    )
+    # Whether a rejected step may be followed by a second one; of a batch of one
+    follows_valleys = False
 
     @abstractmethod
     def evaluate(self, x: torch.Tensor) -> Point:
@@ -163,7 +163,9 @@ class UnitBox(Problem):
         tolerance: float = 0.0,
         evaluated: Callable[[Array, float], None] | None = None,
     ) -> None:
-        self._objective, self._tolerance, self._evaluated = objective, tolerance, evaluated
+        self._objective = objective
+        self._tolerance = tolerance
+        self._evaluated = evaluated
         self.differentiates: bool | None = None
         self._end: Point | None = None  # of the last step, if it needs no evaluation
 

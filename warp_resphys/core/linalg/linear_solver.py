@@ -73,7 +73,8 @@ class CorrectedFactor(Factor):
     """
 
     def __init__(self, factor: Factor, columns: torch.Tensor, order: torch.Tensor) -> None:
-        self.factor, self.columns, self._order = factor, columns, order
+        self.factor = factor
+        self.columns, self._order = columns, order
         self.failed = factor.failed
         self._solved = factor.solve(columns)
         small = (
@@ -106,7 +107,8 @@ class PivotedFactor(Factor):
     """
 
     def __init__(self, solver: "LinearSolver", factor: Factor, values: torch.Tensor) -> None:
-        self._solver, self._factor, self.failed = solver, factor, factor.failed.copy()
+        self._solver, self._factor = solver, factor
+        self.failed = factor.failed.copy()
         self._pivoted: dict[int, Any] = {}
         for number in np.flatnonzero(factor.failed).tolist():
             with suppress(ValueError, RuntimeError):
@@ -323,7 +325,8 @@ class LinearSolver(ABC):
         """Row, column and place in the values of every entry of a matrix."""
         i, j = self._entries(*self._pattern)
         stored = self.address >= 0
-        i, j, place = i[stored], j[stored], self.address[stored].astype(np.int64)
+        i, j = i[stored], j[stored]
+        place = self.address[stored].astype(np.int64)
         off = i != j
         return np.append(i, j[off]), np.append(j, i[off]), np.append(place, place[off])
 

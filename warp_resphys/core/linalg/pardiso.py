@@ -72,7 +72,8 @@ class PardisoSolver(LinearSolver):
         def factorise(number: int, entries: torch.Tensor) -> _System | None:
             environment = (len(values), number)
             if environment not in self._needs_double:
-                if system := self._system(environment, entries.float()):
+                system = self._system(environment, entries.float())
+                if system:
                     return system
                 if entries.dtype == torch.float32:
                     return None

@@ -51,7 +51,8 @@ class _BlasLimit:
     """
 
     def __init__(self) -> None:
-        self._lock, self._users, self._limited = Lock(), 0, list[tuple[LibController, int]]()
+        self._lock, self._users = Lock(), 0
+        self._limited = list[tuple[LibController, int]]()
 
     def begin(self) -> None:
         with self._lock:

@@ -144,7 +144,8 @@ class Section:
     @property
     def arc_centre(self) -> float:
         """Distance from the axis to the centre of the chamber's outer arc [m]."""
-        reach, s, c = self.radius - self.wall, sin(self.half_angle), cos(self.half_angle)
+        reach = self.radius - self.wall
+        s, c = sin(self.half_angle), cos(self.half_angle)
         if self._between_webs:
             return 0.0
         # With centre d and radius a = reach - d, the distance from the middle of the web is d s - a
@@ -172,7 +173,8 @@ class Section:
     def check(self) -> None:
         """Raises MeshError if the chambers do not fit."""
         where = f"where the arm's radius is {1e3 * self.radius:.4g} mm"
-        d, a, s, c = self.arc_centre, self.arc_radius, sin(self.half_angle), cos(self.half_angle)
+        d, a = self.arc_centre, self.arc_radius
+        s, c = sin(self.half_angle), cos(self.half_angle)
         corner = (
             self._beside_web(self.inner_radius) if self.profile == "wedge" else self.inner_radius
         )
@@ -213,7 +215,8 @@ class Section:
 
     def _valley(self) -> complex:
         """Returns the point of the outline at the middle of the web."""
-        d, s, c = self.arc_centre, sin(self.half_angle), cos(self.half_angle)
+        d = self.arc_centre
+        s, c = sin(self.half_angle), cos(self.half_angle)
         if self.outline == "round":
             return complex(self.radius * c, self.radius * s)
         return (
@@ -233,7 +236,8 @@ class Section:
     @cached_property
     def points(self) -> Mapping[str, complex]:
         """The named points."""
-        d, a, half, valley = self.arc_centre, self.arc_radius, self.half_angle, self._valley()
+        d, a = self.arc_centre, self.arc_radius
+        half, valley = self.half_angle, self._valley()
         point = {"O": 0j, "M": complex(self.inner_radius), "V": valley}
         if self.profile == "sector":
             for name, radius in (("C", self.inner_radius), ("E", a)):
@@ -340,9 +344,8 @@ class Section:
                 strips.append(sorted({*sides, *(edge for strip in joined for edge in strip)}))
         numbers = {}
         for strip in strips:
-            pieces = [
-                self.piece(*edge) for edge in [edge for edge in strip if edge in solid] or strip
-            ]
+            solid_edges = [edge for edge in strip if edge in solid]
+            pieces = [self.piece(*edge) for edge in solid_edges or strip]
             least = ceil(max(abs(piece.turn) for piece in pieces) / _LARGEST_TURN)
             length = float(np.mean([abs(piece.end - piece.start) for piece in pieces]))
             numbers.update(dict.fromkeys(strip, max(1, least, round(length / size))))
@@ -383,16 +386,15 @@ class Section:
         A polygon with corners p + e w has the area A0 + A1 e + A2 e^2, which must equal that of the
         curve.
         """
-        start, move, area = [], [], 0.0
+        start, move = [], []
+        area = 0.0
         for first, last in sides:
             piece = self.piece(first, last)
             t = np.linspace(0.0, 1.0, divisions[self.edge(first, last)] + 1)
             area += piece.area
             start.append(piece.points(t))
             move.append(piece.moves(t, self.motion(first), self.motion(last)))
-        p, w = (
-            np.concatenate([parts[0][:1], *(part[1:] for part in parts)]) for parts in (start, move)
-        )
+        p, w = _chained(start), _chained(move)
         a0, a2 = _fan(p, p), _fan(w, w)
         a1 = _fan(p, w) + _fan(w, p)
         lack = area - a0
@@ -472,6 +474,11 @@ class Section:
                     ],
                     SOLID,
                 )
+
+
+def _chained(parts: Sequence[ComplexArray]) -> ComplexArray:
+    """Returns the points of successive sides, without the first of every later side."""
+    return np.concatenate([parts[0][:1], *(part[1:] for part in parts)])
 
 
 def _fan(a: ComplexArray, b: ComplexArray) -> float:

@@ -120,9 +120,8 @@ class Element:
     # (m, 3) exponents of the polynomials onto which the deformation gradient of the volume term is
     # projected against locking; None: means over the cells around each vertex
     volume_modes: IntArray | None
-    volume_rule: Rule | None = (
-        None  # points and weights of the volume term; None: one point with the element's volume
-    )
+    # points and weights of the volume term; None: one point with the element's volume
+    volume_rule: Rule | None = None
     # rule that is exact for products of shape functions, for masses in proportion to the diagonal
     # of the consistent mass matrix; None: row sums
     mass_rule: Rule | None = None

@@ -40,7 +40,8 @@ def plot_parts(
     drawn: Any = pyvista.Plotter(off_screen=screenshot is not None) if plotter is None else plotter
     named = False
     for points, cells, element, regions in parts:
-        names, linear, region = list(regions), ELEMENTS[element.linear], np.full(len(cells), -1)
+        names, linear = list(regions), ELEMENTS[element.linear]
+        region = np.full(len(cells), -1)
         for number, name in enumerate(names):
             region[regions[name]] = number
         for number in np.unique(region).tolist():

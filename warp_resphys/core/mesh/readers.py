@@ -123,7 +123,9 @@ def write_mesh(
 
     path = Path(path)
     kind = mesh.element.file_type
-    blocks, groups, fields = [(kind, mesh.cells)], [np.zeros(len(mesh.cells), dtype=np.int64)], {}
+    blocks = [(kind, mesh.cells)]
+    groups = [np.zeros(len(mesh.cells), dtype=np.int64)]
+    fields = {}
     as_gmsh = path.suffix.lower() == ".msh"
     if as_gmsh:
         groups[0] += 1

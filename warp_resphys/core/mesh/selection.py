@@ -76,7 +76,8 @@ def vertices_at(mesh: Mesh, place: Place) -> IntArray:
         raise MeshError("a selection of vertices needs at least one of the coordinates x, y and z")
     chosen = np.flatnonzero(place.holds(mesh.vertices))
     if not len(chosen):
-        low, high, axes = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0), [*place.spans]
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        axes = [*place.spans]
         there = ", ".join(
             f"{axis} from {low['xyz'.index(axis)]:g} to {high['xyz'.index(axis)]:g}"
             for axis in axes

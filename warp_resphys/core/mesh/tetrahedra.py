@@ -23,9 +23,8 @@ _TETRAHEDRON, _TRIANGLE = 4, 2  # gmsh's numbers of linear cells
 # Angles between triangles above which their edge is preserved, tried in turn [deg].
 _ANGLES = (40.0, 30.0, 20.0)
 _VOLUME = 0.08  # largest relative difference between the volumes of mesh and surface
-_REACH = (
-    0.5  # largest difference between the bounding boxes of mesh and surface, over the cell size
-)
+# Largest difference between the bounding boxes of mesh and surface, over the cell size
+_REACH = 0.5
 
 SURFACE_SUFFIXES = (".stl", ".obj", ".ply")
 _DIMENSIONS = ("edges", "surfaces", "volume")

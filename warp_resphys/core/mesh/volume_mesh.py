@@ -173,7 +173,8 @@ def check_mesh(mesh: Mesh, cracks: bool = False) -> None:
             belongs to no cell; two vertices coincide; a cell has a vertex twice, or the vertices of
             another cell, or is flat, turned or folded.
     """
-    vertices, cells, count = mesh.vertices, mesh.cells, len(mesh.vertices)
+    vertices, cells = mesh.vertices, mesh.cells
+    count = len(vertices)
     if count == 0 or len(cells) == 0:
         raise MeshError(f"the mesh is empty: it has {count} vertices and {len(cells)} cells")
     _refuse(
@@ -300,7 +301,8 @@ def join(meshes: Mapping[str, Mesh]) -> Mesh:
             f"meshes of {' and '.join(sorted(kinds))} cells cannot be joined: give "
             f"{' and '.join(meshes)} cells of one kind."
         )
-    cells, first, count = [], 0, 0
+    cells = []
+    first, count = 0, 0
     regions: dict[str, IntArray] = {}
     for name, mesh in meshes.items():
         cells.append(mesh.cells + first)

@@ -69,7 +69,8 @@ class Inputs:
         self.external_force, self.fixed_positions, self.attached_mass, self.internal_force = batched
         self.actuation: dict[str, torch.Tensor] = {}
         for name, value in actuation.items():
-            if (values := _batched(name, value, 1)) is not None:
+            values = _batched(name, value, 1)
+            if values is not None:
                 self.actuation[name] = values
                 if not values.ndim:
                     self.plain |= {name}

@@ -47,7 +47,8 @@ class Reaction(Brief):
             return None
         return cls(
             known[0].vertices,
-            *(torch.stack([getattr(one, key) for one in known]) for key in ("forces", "places")),
+            torch.stack([one.forces for one in known]),
+            torch.stack([one.places for one in known]),
         )
 
     @classmethod
@@ -55,10 +56,8 @@ class Reaction(Brief):
         """Returns those of several sets of vertices as one."""
         return cls(
             torch.cat([one.vertices for one in reactions]),
-            *(
-                torch.cat([getattr(one, key) for one in reactions], -2)
-                for key in ("forces", "places")
-            ),
+            torch.cat([one.forces for one in reactions], -2),
+            torch.cat([one.places for one in reactions], -2),
         )
 
     @property
@@ -293,6 +292,11 @@ class ImplicitStage:
     end: float = 1.0  # time of x, as a fraction of the time step
 
 
+def _total(terms: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Returns the sum of tensors of any batch."""
+    return torch.stack(torch.broadcast_tensors(*terms)).sum(0)
+
+
 @dataclass(frozen=True)
 class Mass:
     """Differentiable vertex masses of one energy or of a whole body."""
@@ -307,12 +311,9 @@ class Mass:
 
         Damping at a shared vertex is the mean weighted by mass.
         """
-        inertia, weight, damping = (
-            torch.stack(torch.broadcast_tensors(*terms)).sum(0)
-            for terms in zip(
-                *((m.inertia, m.weight, m.damping * m.inertia) for m in masses), strict=True
-            )
-        )
+        inertia = _total([m.inertia for m in masses])
+        weight = _total([m.weight for m in masses])
+        damping = _total([m.damping * m.inertia for m in masses])
         return cls(inertia, weight, damping / torch.where(inertia > 0.0, inertia, 1.0))
 
 

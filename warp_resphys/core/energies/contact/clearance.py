@@ -40,8 +40,10 @@ class Clearance:
         free: torch.Tensor,
         rigid: Sequence[tuple[torch.Tensor, torch.Tensor]],
     ) -> None:
-        self._obstacles, self._distance, self._shapes = obstacles, distance, shapes
-        self._vertices, self._free, self._rigid = vertices, free, rigid
+        self._obstacles, self._shapes = obstacles, shapes
+        self._distance = distance
+        self._vertices, self._free = vertices, free
+        self._rigid = rigid
 
     def check_way(
         self, carried: torch.Tensor, ends: torch.Tensor, pose: Pose, gaps: torch.Tensor
@@ -123,7 +125,8 @@ class Clearance:
         """Raises InputError for a distance that fits no contact,
         and warns of a start that throws the body away.
         """
-        surface, names, reach = rest[self._vertices], list(self._obstacles), self._distance
+        surface = rest[self._vertices]
+        reach = self._distance
         thickness = float((surface.amax(0) - surface.amin(0)).min())
         if reach > thickness:
             raise InputError(
@@ -134,10 +137,13 @@ class Clearance:
         self.check(rest[None], pose, "at rest", d)
         least = d.amin((0, 1))
         if bool((least < _DEEP * reach).any()):
+            nearest = list(self._obstacles)[int(least.argmin())]
             log.warning(
                 "The body starts %.2g mm from %s, deep in its barrier, which throws it away: "
                 "start it at contact.distance (%g mm) or further, or hold it there.",
-                *(1e3 * float(least.min()), names[int(least.argmin())], 1e3 * reach),
+                1e3 * float(least.min()),
+                nearest,
+                1e3 * reach,
             )
 
     def check(self, q: torch.Tensor, pose: Pose, when: str, d: torch.Tensor | None = None) -> None:

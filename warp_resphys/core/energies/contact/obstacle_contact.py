@@ -83,9 +83,8 @@ class Contact(Energy):
     is_barrier: ClassVar[bool] = True
 
     obstacles: Mapping[str, Obstacle]
-    stiffness: Parameter | Mapping[str, float] = (
-        1e5  # kappa [Pa], a number or one by obstacle, in order or by name
-    )
+    # kappa [Pa], a number or one by obstacle, in order or by name
+    stiffness: Parameter | Mapping[str, float] = 1e5
     friction: Parameter | Mapping[str, float] = 0.0  # mu, likewise
     distance: float = 1e-3  # D [m]
     slip_speed: float = 1e-3  # v_s [m/s]
@@ -233,7 +232,8 @@ class BoundContact(BoundEnergy):
         for name in site.body.controls:
             cells = site.body.mesh.cells[site.body.mesh.region(name)]
             part = torch.as_tensor(np.unique(cells) + site.first, device=like.device)
-            if len(surface := torch.isin(self._vertices, part).nonzero().ravel()):
+            surface = torch.isin(self._vertices, part).nonzero().ravel()
+            if len(surface):
                 # Others are out of reach.
                 rigid.append((surface, part[~torch.isin(part, self._vertices)]))
         self._clearance = Clearance(
@@ -373,8 +373,7 @@ class BoundContact(BoundEnergy):
         """Returns the poses at the start of a step and one step before."""
         if not self._contact.moves:
             return now, now
-        memory = step.state.memory
-        poses = [memory.get(name) for name in (m.name for m in self.memory)]
+        poses = [step.state.memory.get(m.name) for m in self.memory]
         if poses[0] is None or poses[1] is None:
             rest = (
                 now

@@ -15,9 +15,8 @@ from .obstacle_contact import Contact
 from .obstacle_poses import Pose
 from .obstacles import Obstacle, surface_of
 
-_NEAR: Final = (
-    0.2  # Width of the space around a body in which its obstacles are shown, over its size.
-)
+# Width of the space around a body in which its obstacles are shown, over its size.
+_NEAR: Final = 0.2
 
 
 @dataclass(frozen=True, eq=False)

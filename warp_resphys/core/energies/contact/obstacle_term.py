@@ -68,8 +68,14 @@ class ContactTerm(Term):
         friction = struct_of(
             kernels.Friction, **{field: self.values[name] for field, name in names.items()}
         )
-        area = warp_view(self._area, wp.float64)
-        return [s.points, area, self._obstacles(), self.view(STIFFNESS.name), friction, positions]
+        return [
+            s.points,
+            warp_view(self._area, wp.float64),
+            self._obstacles(),
+            self.view(STIFFNESS.name),
+            friction,
+            positions,
+        ]
 
     @override
     def feasible(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -89,7 +95,9 @@ class ContactTerm(Term):
 
     @override
     def adjoint(self, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
-        batch, (s,), size = self.launcher, self.sets, (self.n_points, self._count)
+        batch = self.launcher
+        (s,) = self.sets
+        size = (self.n_points, self._count)
         names = (
             "place",
             "turn",

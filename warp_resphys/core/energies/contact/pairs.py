@@ -156,7 +156,8 @@ class PairList:
     """
 
     def __init__(self, launcher: Launcher, surface: Surface, reach: float) -> None:
-        self._launcher, self.surface, self.reach = launcher, surface, reach
+        self._launcher = launcher
+        self.surface, self.reach = surface, reach
         device, n = launcher.device, len(surface.rest)
 
         def tensor(values: Any, dtype: torch.dtype = torch.int64) -> torch.Tensor:
@@ -190,7 +191,8 @@ class PairList:
         extent = np.ptp(surface.rest[surface.vertices], axis=0)
         self.longest_way = 0.1 * float(np.linalg.norm(extent))  # of a vertex at a time [m]
         self._least_radius = 0.5 * reach
-        self._capacity, self.version, self.count = _FIRST_CAPACITY, 0, 0
+        self._capacity = _FIRST_CAPACITY
+        self.version = self.count = 0
         self._origin: torch.Tensor | None = None
         self._hierarchies: dict[int, _Hierarchy] = {}
         self._outer = self._inner = launcher.zeros(n)
@@ -220,7 +222,8 @@ class PairList:
         """
         launcher, surface = self._launcher, self.surface
         outer, inner = (_SPARE * size + self._least_radius for size in self._ways(ways))
-        self._origin, self._outer, self._inner = origin + 0.5 * ways, outer, inner
+        self._origin = origin + 0.5 * ways
+        self._outer, self._inner = outer, inner
         motion = struct_of(
             broad_phase.Sweep,
             origin=self._origin,
@@ -245,7 +248,8 @@ class PairList:
                 launcher.run(
                     broad_phase.close_pairs, (launcher.batch, first.shape[0]), inputs, [pair_keys]
                 )
-            if (needed := int(count)) <= self._capacity:
+            needed = int(count)
+            if needed <= self._capacity:
                 break
             self._capacity = 2 * needed  # The list is made again.
         self._set(keys[:needed].sort().values, size, total)

@@ -151,8 +151,7 @@ class BoundSurfaceContact(BoundEnergy):
         (points,) = site.points
         assert isinstance(points, SurfacePoints)
         self._vertices = torch.as_tensor(points.nodes[:, 0], device=rest.device)
-        launcher = Launcher(1, rest.device)
-        pairs = PairList(launcher, points.placed(len(rest)), contact.distance)
+        pairs = PairList(Launcher(1, rest.device), points.placed(len(rest)), contact.distance)
         self._check_rest(pairs, rest.double()[None])
 
     def _check_rest(self, pairs: PairList, rest: torch.Tensor) -> None:

@@ -45,7 +45,8 @@ class NearPairs(NamedTuple):
         environment, nodes = pairs.environment[chosen], pairs.nodes[chosen]
         ends = x[environment[:, None], nodes]
         # Weights that do not change here, but whose derivatives are those of the nearest points.
-        r, e, f = w @ ends, t @ ends, s @ ends
+        r = w @ ends
+        e, f = t @ ends, s @ ends
         ee = (e * e).sum(-1) + (t == 0.0).all(-1).double()
         ff, ef = (f * f).sum(-1) + (s == 0.0).all(-1).double(), (e * f).sum(-1)
         whole = torch.maximum(ee * ff - ef * ef, 1e-12 * ee * ff)
@@ -146,13 +147,13 @@ class Grips:
     @classmethod
     def of(cls, pairs: PairList, sliding: Sliding) -> "Grips":
         """Returns friction of pairs (G, ...) (`kernels.contact.surface_pairs.FrictionPairs`)."""
-        environment, nodes, load = sliding.environment, sliding.nodes, sliding.load
+        environment, nodes = sliding.environment, sliding.nodes
         kept = {
             name: (value if value.is_floating_point() else value.to(torch.int32)).contiguous()
             for name, value in sliding._asdict().items()
         }
         struct = struct_of(kernels.FrictionPairs, **kept)
-        sums = load.new_zeros(len(load), 4, 3), torch.zeros_like(load)
+        sums = sliding.load.new_zeros(len(nodes), 4, 3), torch.zeros_like(sliding.load)
         incidence = pairs.incidence(environment, nodes)
         outputs = [warp_view(sums[0], nearest_points.Corners), warp_view(sums[1], wp.float64)]
         return cls(environment, nodes, struct, outputs, [warp_view(x, wp.int32) for x in incidence])

@@ -161,8 +161,13 @@ class SurfaceTerm(Term):
         launcher, pairs = self.launcher, self._list
         if self._sized != pairs.version:
             self._size(pairs.count)
-        stiffness = self.view(STIFFNESS.name)
-        inputs = [active, pairs.pairs, stiffness, wp.float64(self._reach), positions]
+        inputs = [
+            active,
+            pairs.pairs,
+            self.view(STIFFNESS.name),
+            wp.float64(self._reach),
+            positions,
+        ]
         pair_out = [
             warp_view(self._pair_force, nearest_points.Corners),
             warp_view(self._pair_energy, wp.float64),
@@ -178,7 +183,8 @@ class SurfaceTerm(Term):
         commands.append(
             launcher.record(kernels.gather, size, [*incidence, *pair_out, self.n_points, 0], sums)
         )
-        if (grips := self._grips) is not None:
+        grips = self._grips
+        if grips is not None:
             inputs = [active, grips.struct, *self._friction(), positions]
             commands.append(
                 launcher.record(kernels.grip_forces, (grips.count,), inputs, grips.outputs)
@@ -214,16 +220,16 @@ class SurfaceTerm(Term):
     def pair_tangents(
         self, positions: Any, clamp: bool, active: torch.Tensor
     ) -> PairTangents | None:
-        launcher, chosen, parts = self.launcher, self._chosen(active), list[PairTangents]()
+        launcher, chosen = self.launcher, self._chosen(active)
+        parts = list[PairTangents]()
         if self._whole is not None:
             positions = warp_view(self._expand(wp.to_torch(positions), self._whole), wp.vec3d)
         if len(chosen):
             indices, blocks = chosen.to(torch.int32), self._force.new_zeros(len(chosen), 12, 12)
-            stiffness = self.view(STIFFNESS.name)
             inputs = [
                 warp_view(indices, wp.int32),
                 self._list.pairs,
-                stiffness,
+                self.view(STIFFNESS.name),
                 wp.float64(self._reach),
                 positions,
             ]
@@ -233,7 +239,8 @@ class SurfaceTerm(Term):
             parts.append(
                 PairTangents(self._list.environment[chosen], self._list.nodes[chosen], blocks)
             )
-        if (grips := self._grips) is not None:
+        grips = self._grips
+        if grips is not None:
             blocks = self._force.new_zeros(grips.count, 12, 12)
             inputs = [grips.struct, *self._friction(), positions]
             launcher.run(
@@ -243,8 +250,11 @@ class SurfaceTerm(Term):
             parts.append(PairTangents(grips.environment[used], grips.nodes[used], blocks[used]))
         if not parts:
             return None
-        names = ("environment", "nodes", "blocks")
-        return PairTangents(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+        return PairTangents(
+            torch.cat([part.environment for part in parts]),
+            torch.cat([part.nodes for part in parts]),
+            torch.cat([part.blocks for part in parts]),
+        )
 
     @override
     def feasible(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -258,7 +268,8 @@ class SurfaceTerm(Term):
         """Returns the launch that bounds a way, after a search for pairs along it,
         and limits its length.
         """
-        launcher, pairs, self._bounded = self.launcher, self._list, True
+        launcher, pairs = self.launcher, self._list
+        self._bounded = True
         start = self._expand(wp.to_torch(origin))
         end = self._expand(wp.to_torch(positions))
         part = wp.to_torch(share)
@@ -330,7 +341,8 @@ class SurfaceTerm(Term):
         gap = torch.full_like(x[..., 0], self._reach)
         slide = torch.full_like(gap, -1.0)
         start, stiffness = value_of(values, "surface_start"), value_of(values, STIFFNESS.name)
-        if (slides := self.sliding(start, stiffness)) is not None:
+        slides = self.sliding(start, stiffness)
+        if slides is not None:
             names = ("surface_reference", FRICTION.name, "surface_slip")
             force = slides.force(x, *(value_of(values, name) for name in names))
             ways = (
@@ -345,7 +357,8 @@ class SurfaceTerm(Term):
             friction = friction.index_put(
                 place, slides.weights[..., None] * force[:, None], accumulate=True
             )
-        if len(chosen := self._near_at(x.detach())):
+        chosen = self._near_at(x.detach())
+        if len(chosen):
             differentiable = torch.is_grad_enabled()
             with torch.enable_grad():
                 leaf = x if x.requires_grad else x.detach().requires_grad_()
@@ -384,7 +397,8 @@ class SurfaceTerm(Term):
             ]
             slopes = tuple(torch.zeros_like(value) for value in leaves)
             with torch.enable_grad():
-                if (slides := self.sliding(start, stiffness)) is not None:
+                slides = self.sliding(start, stiffness)
+                if slides is not None:
                     force = slides.force(x, reference, friction, self.values["surface_slip"])
                     along = ways[slides.environment[:, None], slides.nodes]
                     work = (slides.weights[..., None] * along * force[:, None]).sum()

@@ -35,10 +35,8 @@ class Evaluator:
 
     def __init__(self, network: StateMap, range_: Range | None) -> None:
         assert isinstance(network.network, SkipMLP)
-        self._blocks = [
-            [_layer(layer) for layer in cast(nn.Sequential, block)]
-            for block in network.network.blocks
-        ]
+        blocks = [cast(nn.Sequential, block) for block in network.network.blocks]
+        self._blocks = [list(map(_layer, block)) for block in blocks]
         self._linear, self._remainder = (
             network.linear.numpy(force=True),
             network.remainder.numpy(force=True),
@@ -156,7 +154,9 @@ class ForceAlong:
         base = static(u)
         at_rest = np.concatenate([base, np.zeros_like(base)], axis=1)
         self._evaluated = force.outputs
-        self._seen, self._usual, self._push = force.seen(u), force.usual(u), force.push(u)
+        self._seen = force.seen(u)
+        self._usual = force.usual(u)
+        self._push = force.push(u)
         conditions = np.tile(force.conditions, (len(base), 1))
         if len(force.conditions_by):
             conditions = conditions + with_means(u.points, means) @ force.conditions_by.T

@@ -58,9 +58,7 @@ class MarkerView:
         if not self.shape_alone:
             return
         if self.sets:
-            if len({marker for members in self.sets for marker in members}) < sum(
-                map(len, self.sets)
-            ):
+            if len(set().union(*self.sets)) < sum(map(len, self.sets)):
                 raise InputError(
                     "markers.frame is own, but two trials have some markers in common, and not "
                     "all: they must have the same ones, or none in common."
@@ -155,7 +153,8 @@ class MarkerView:
         of markers (..., m, 3) to their nominal places.
         """
         middle, here = self.nominal.mean(-2), markers.mean(-2, keepdim=True)
-        nominal, now, moved = self.nominal - middle, markers - here, points - here
+        nominal = self.nominal - middle
+        now, moved = markers - here, points - here
         if self.plane is None:
             rotation = closest_rotation((now.mT @ nominal).reshape(-1, 3, 3)).reshape(
                 *now.shape[:-2], 3, 3

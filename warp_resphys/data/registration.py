@@ -80,7 +80,8 @@ def fit(a: FloatArray, b: FloatArray, weights: FloatArray) -> tuple[RigidTransfo
     share = (weights / weights.sum(axis=-1, keepdims=True))[..., None]
     centre_a = (share * a).sum(axis=-2, keepdims=True)
     centre_b = (share * b).sum(axis=-2, keepdims=True)
-    u, singular, vt = np.linalg.svd(np.swapaxes(share * (b - centre_b), -1, -2) @ (a - centre_a))
+    covariance = np.swapaxes(share * (b - centre_b), -1, -2) @ (a - centre_a)
+    u, singular, vt = np.linalg.svd(covariance)
     u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
     rotation = u @ vt
     translation = centre_b[..., 0, :] - (rotation @ centre_a[..., 0, :, None])[..., 0]
@@ -164,7 +165,8 @@ def register_markers(
     used = _used(
         a, b, names, use, source, 1 if rotation is not None else 3 if vertical is None else 2
     )
-    fewest, turned, shown = max(4, len(used) // 2 + 1), None, ""
+    fewest = max(4, len(used) // 2 + 1)
+    turned, shown = None, ""
     if rotation is not None:
         fewest, turned = len(used) // 2 + 1, np.asarray(rotation, dtype=np.float64)
         shown = " with the axes that are given"
@@ -210,7 +212,8 @@ def _used(
             f"{len(names)} markers are named, with measured positions {a.shape} and nominal ones "
             f"{b.shape}: both must be (markers, 3)."
         )
-    if unknown := [name for name in use or () if name not in names]:
+    unknown = [name for name in use or () if name not in names]
+    if unknown:
         raise InputError(
             f"Registration should use {listed(unknown)}, but the markers are {listed(names)}."
         )

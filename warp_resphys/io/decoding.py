@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -95,10 +96,11 @@ def c3d_arrays(path: str) -> Arrays:
     )
     # Model outputs of Vicon.
     computed = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")
+    outputs = [name for name in computed if name in point]
     texts = {
-        "labels": [label for name in parts for label in point[name]["value"]],
+        "labels": list(chain.from_iterable(point[name]["value"] for name in parts)),
         "units": point["UNITS"]["value"] if "UNITS" in point else [],
-        "computed": [label for name in computed if name in point for label in point[name]["value"]],
+        "computed": list(chain.from_iterable(point[name]["value"] for name in outputs)),
     }
     return {
         "points": np.asarray(file["data"]["points"], dtype=np.float64),
@@ -184,7 +186,8 @@ def mesh_arrays(path: str, file_format: str | None = None) -> Arrays:
     suffix = {None: Path(path).suffix.lower(), "gmsh": ".msh", "abaqus": ".inp"}.get(file_format)
     with Path(path).open("rb") as file:
         of_fluent = suffix == ".msh" and file.read(1) == b"("  # which meshio writes by default
-    if of_fluent or (reader := MESH_READERS.get(suffix or "")) is None:
+    reader = MESH_READERS.get(suffix or "")
+    if of_fluent or reader is None:
         return mesh_arrays_of(*_read_by_meshio(path, file_format))
     try:
         return mesh_arrays_of(*reader(path))

@@ -154,9 +154,7 @@ class ForceAlong:
         base = static(u)
         at_rest = np.concatenate([base, np.zeros_like(base)], axis=1)
         self._evaluated = force.outputs
-        self._seen = force.seen(u)
-        self._usual = force.usual(u)
-        self._push = force.push(u)
+        self._seen, self._usual, self._push = force.seen(u), force.usual(u), force.push(u)
         conditions = np.tile(force.conditions, (len(base), 1))
         if len(force.conditions_by):
             conditions = conditions + with_means(u.points, means) @ force.conditions_by.T

@@ -189,9 +189,9 @@ class Source:
         damping = {
             name: 0.0 for name in simulator.parameters if name.endswith((*VISCOUS, MASS_DAMPING))
         }
-        words = dict[str, str]()
-        for name in simulator.parameters:
-            words |= {name: word for word in PRONY_RATIOS if word in name}
+        words = {
+            name: word for name in simulator.parameters for word in PRONY_RATIOS if word in name
+        }
         ratios = dict.fromkeys(words, 0.0)
         self._viscous, self._elastic = (
             robot.with_parameters(**ratios),

@@ -80,8 +80,7 @@ def fit(a: FloatArray, b: FloatArray, weights: FloatArray) -> tuple[RigidTransfo
     share = (weights / weights.sum(axis=-1, keepdims=True))[..., None]
     centre_a = (share * a).sum(axis=-2, keepdims=True)
     centre_b = (share * b).sum(axis=-2, keepdims=True)
-    covariance = np.swapaxes(share * (b - centre_b), -1, -2) @ (a - centre_a)
-    u, singular, vt = np.linalg.svd(covariance)
+    u, singular, vt = np.linalg.svd(np.swapaxes(share * (b - centre_b), -1, -2) @ (a - centre_a))
     u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
     rotation = u @ vt
     translation = centre_b[..., 0, :] - (rotation @ centre_a[..., 0, :, None])[..., 0]

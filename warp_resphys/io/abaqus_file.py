@@ -10,7 +10,6 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -265,8 +264,7 @@ def _elements(scope: _Scope, kind: str, data: list[str]) -> IntArray:
                 f"elements {kind} are not read; mesh the body with C3D4, C3D8, C3D10 or C3D20"
             )
         return np.empty(0, dtype=np.int64)
-    words = chain.from_iterable(map(_words, data))
-    rows = np.array([int(word) for word in words], dtype=np.int64)
+    rows = np.array([int(word) for line in data for word in _words(line)], dtype=np.int64)
     if rows.size % (1 + count):
         raise DecodingError(f"each {kind} must have a number and {count} nodes")
     rows = rows.reshape(-1, 1 + count)

@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,11 +95,10 @@ def c3d_arrays(path: str) -> Arrays:
     )
     # Model outputs of Vicon.
     computed = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")
-    outputs = [name for name in computed if name in point]
     texts = {
-        "labels": list(chain.from_iterable(point[name]["value"] for name in parts)),
+        "labels": [label for name in parts for label in point[name]["value"]],
         "units": point["UNITS"]["value"] if "UNITS" in point else [],
-        "computed": list(chain.from_iterable(point[name]["value"] for name in outputs)),
+        "computed": [label for name in computed if name in point for label in point[name]["value"]],
     }
     return {
         "points": np.asarray(file["data"]["points"], dtype=np.float64),

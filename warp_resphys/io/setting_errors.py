@@ -8,7 +8,6 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any, Final
 
 from pydantic_core import ErrorDetails
@@ -90,8 +89,11 @@ def sentence(schema: Schema, values: Any, where: str, errors: Sequence[ErrorDeta
         return f"{key} is missing: it must be {_in_words(place.node, schema)}."
     if kind.startswith("union_tag") and isinstance(value, Mapping):
         tag = str(error["ctx"]["discriminator"]).strip("'")
-        tags = [option["properties"][tag] for option in options(schema, place.node)]
-        words = [str(word) for word in chain.from_iterable(map(_words_of, tags))]
+        words = [
+            str(word)
+            for option in options(schema, place.node)
+            for word in _words_of(option["properties"][tag])
+        ]
         return (
             f"{_dotted([tag], key)} is {_shown(value.get(tag))}: it must be one of "
             f"{', '.join(words)}."

@@ -39,9 +39,9 @@ def read_published_segment(path: str | Path) -> dict[int, Recording]:
     """
     path = Path(path)
     arrays, recordings = read_arrays(path), dict[int, Recording]()
-    pressure = numbers(arrays, "pressure_mbar", path)
-    markers = numbers(arrays, "markers", path)
-    rate = numbers(arrays, "rate_hz", path)
+    pressure, markers, rate = (
+        numbers(arrays, name, path) for name in ("pressure_mbar", "markers", "rate_hz")
+    )
     if (
         markers.ndim != 4
         or markers.shape[2:] != (7, 3)

@@ -216,8 +216,7 @@ def _driven(settings: StageSettings, folder: Path, name: str, steps: int, report
     """
     control = settings.control
     robot = load(folder, control.models[-1], settings.device)
-    task = Task(control, robot)
-    driven = driven_input(robot)
+    task, driven = Task(control, robot), driven_input(robot)
     count = len(controllers_of(control))
     laboratory = Laboratory(settings, folder, driven.name, count, motions_of(control).index(name))
     plans = {

@@ -77,8 +77,8 @@ class Planner:
     ) -> None:
         self.model, self.limits = model, limits
         self.tracked, self.path = tracked, path
-        steps, pieces = horizon.steps, horizon.pieces
-        self.steps = steps
+        self.steps = steps = horizon.steps
+        pieces = horizon.pieces
         self._weight, self._iterations = horizon.weight, horizon.iterations
         ends = np.arange(1, steps + 1) / steps * pieces  # of the steps, in pieces
         self._lines = np.maximum(1.0 - np.abs(ends[:, None] - np.arange(pieces + 1.0)), 0.0)

@@ -287,8 +287,7 @@ class ReducedModel:
         back[1:] = self.integrator == "bdf2"
         share = np.where(back, 1.0 / 3.0, 0.0).reshape(-1, 1)  # g
         step = np.where(back, 2.0 / 3.0 * h, h).reshape(-1, 1)
-        base = self.static(u)
-        a, damping = self.stiffness(u), self.damping(u)
+        base, a, damping = self.static(u), self.stiffness(u), self.damping(u)
         inertia = np.eye(r) / step[..., None] ** 2 + damping / step[..., None]
         branches, (decay, gamma) = self.branches(u), self.relaxation
         relaxed = np.einsum("k,skrq->srq", gamma, branches)

@@ -131,9 +131,8 @@ def _curve(name: str) -> FloatArray:
         return _even(np.stack([np.sin(2.0 * angle) / 2.0, np.cos(angle)], axis=1))
     if name not in _LETTERS:
         raise InputError(f"the path is {name!r}: choose circle, eight, or a capital letter.")
-    cells = [at.split(",") if "," in at else [*at] for at in _LETTERS[name].split()]
-    corners = np.array(cells, dtype=np.float64)
-    straight = _even(corners)
+    corners = [at.split(",") if "," in at else [*at] for at in _LETTERS[name].split()]
+    straight = _even(np.array(corners, dtype=np.float64))
     return _even(gaussian_filter1d(straight, _CORNER * _RESOLUTION / 2.0, axis=0, mode="nearest"))
 
 

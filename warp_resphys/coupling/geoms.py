@@ -22,8 +22,7 @@ class GeomSurfaces:
 
     def __init__(self, model: Any) -> None:
         self._points = dict[int, FloatArray]()
-        triangles = [np.zeros((0, 3), dtype=np.int64)]
-        first = 0
+        triangles, first = [np.zeros((0, 3), dtype=np.int64)], 0
         for geom, size in enumerate(model.geom_size):
             solid = _solid(int(model.geom_type[geom]), *size)
             if solid is not None:

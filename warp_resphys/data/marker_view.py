@@ -153,8 +153,7 @@ class MarkerView:
         of markers (..., m, 3) to their nominal places.
         """
         middle, here = self.nominal.mean(-2), markers.mean(-2, keepdim=True)
-        nominal = self.nominal - middle
-        now, moved = markers - here, points - here
+        nominal, now, moved = self.nominal - middle, markers - here, points - here
         if self.plane is None:
             rotation = closest_rotation((now.mT @ nominal).reshape(-1, 3, 3)).reshape(
                 *now.shape[:-2], 3, 3

@@ -46,8 +46,7 @@ def with_corners(recording: Recording, lengths: Mapping[str, float]) -> Recordin
     Raises:
         DataFileError: the recording has no rigid body of a name, or one without orientation.
     """
-    labels, rest = recording.labels, recording.rest
-    positions = recording.positions
+    labels, positions, rest = recording.labels, recording.positions, recording.rest
     for name, length in lengths.items():
         axes = [f"{name} +{axis}" for axis in "xyz"]
         if name not in labels:

@@ -159,8 +159,7 @@ class Trials(Brief):
             "inputs": tuple(self.inputs),
         }
         words |= {"sessions": self.sessions} if self.sessions else {}
-        groups = {key: getattr(self, key) for key in _GROUPS}
-        words |= {key: tuple(values) for key, values in groups.items() if values}
+        words |= {key: tuple(values) for key in _GROUPS if (values := getattr(self, key))}
         words |= {f"{name}{_CHANNELS}": channels for name, channels in self.channels.items()}
         attributes = {
             **{key: list(strings) for key, strings in words.items()},

@@ -138,8 +138,7 @@ class ScriptedPlace:
 
     def _act(self, seen: FloatArray) -> FloatArray:
         """Returns the action (7,) for an observation (width,)."""
-        fingers, angles = seen[-14], seen[-13:-7]
-        lifted = seen[-1]
+        fingers, angles, lifted = seen[-14], seen[-13:-7], seen[-1]
         to_ball, to_goal = self._size * seen[-7:-1].reshape(2, 3)
         still = float(np.abs(seen[len(seen) // 2 - 7 : -14]).max()) < _UNMOVED
         is_open, is_closed = fingers < _END - 1.0, fingers > 1.0 - _END

@@ -118,16 +118,15 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         self.actions, self.frames = actions, mapping.frames
         self._noise = options.noise if world.noise is None else world.noise
         self.num_envs, self.render_mode = world.count, options.render_mode
-        mode = AutoresetMode(options.autoreset_mode)
+        self._mode = AutoresetMode(options.autoreset_mode)
         rate = round(1.0 / (world.time_step * mapping.frames))
         self.metadata = {
             "render_modes": [*RENDER_MODES],
             "render_fps": rate,
-            "autoreset_mode": mode,
+            "autoreset_mode": self._mode,
         }
         self._up = np.asarray(options.up, dtype=np.float64)
         self._camera: Camera | None = None
-        self._mode = mode
         self.state = world.rest
         self.rests = world.markers(self.state)
         self._forces, self._squeeze = options.forces, options.squeeze

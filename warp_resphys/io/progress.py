@@ -264,9 +264,10 @@ def aligned(rows: Sequence[Sequence[str]], left: int = 1) -> str:
     the others to the right.
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = list[str]()
-    for row in rows:
-        cells = list(map(str.ljust, row[:left], widths[:left]))
-        cells += map(str.rjust, row[left:], widths[left:])
-        lines.append("  ".join(cells).rstrip())
-    return "\n".join(lines)
+
+    def line(row: Sequence[str]) -> str:
+        names = map(str.ljust, row[:left], widths[:left])
+        numbers = map(str.rjust, row[left:], widths[left:])
+        return "  ".join([*names, *numbers]).rstrip()
+
+    return "\n".join(map(line, rows))

@@ -291,8 +291,7 @@ def compare_base(
         raise InputError(
             f"The base has {len(labels)} markers: name two or more that sit on the clamp."
         )
-    places = list[FloatArray]()
-    shifts, distortions = list[FloatArray](), list[FloatArray]()
+    places, shifts, distortions = list[FloatArray](), list[FloatArray](), list[FloatArray]()
     for recording in recordings:
         base = recording.select(labels)
         absent = [label for label, seen in zip(labels, base.seen.T, strict=True) if not seen.any()]

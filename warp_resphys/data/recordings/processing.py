@@ -93,9 +93,8 @@ def resample(recording: Recording, rate: float) -> Recording:
         kept = known[below] & known[above]
         if kept.any() and np.count_nonzero(known) > 1:
             positions[kept, column] = bridged(recording, column, new[kept])
-    actuation = None
-    if recording.actuation is not None:
-        actuation = _interpolated(recording.actuation, old, new)
+    driven = recording.actuation
+    actuation = None if driven is None else _interpolated(driven, old, new)
     base = None if recording.base is None else at_times(recording.base, old, new)
     moved = {name: at_times(poses, old, new) for name, poses in recording.obstacles.items()}
     loads = {  # NaN beside NaN

@@ -290,9 +290,8 @@ def _with_arms(recording: Recording) -> Recording:
     """Adds the points on the axes of rigid bodies, with unknown rest positions,
     in place of the quaternions.
     """
-    path, names = recording.source, recording.labels
-    positions, turns = recording.positions, recording.turns
-    rest = recording.rest
+    names, positions, rest = recording.labels, recording.positions, recording.rest
+    turns, path = recording.turns, recording.source
     if turns is None:
         return recording
     if turns.shape != (*positions.shape[:2], 4):

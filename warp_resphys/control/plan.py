@@ -263,10 +263,8 @@ def follow(
         errors.append(1e3 * np.linalg.norm(points - paths, axis=2).mean(1))
         for row, error in enumerate(errors[-1]):
             if error < best[row]:
-                best[row] = error
-                kept[row] = inputs[row]
-                kept_markers[row] = markers[row]
-                shares[row] = 1.0
+                best[row], shares[row] = error, 1.0
+                kept[row], kept_markers[row] = inputs[row], markers[row]
                 offset = points[row] - model.respond(start, inputs[row][:, None])[:, 0] @ tracked.T
                 wanted[row] = _planned(model, planner_of(paths[row]), offset)
             else:

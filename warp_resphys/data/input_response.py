@@ -199,8 +199,7 @@ class InputResponse:
         if network is not None:
             self._kept_felt = [_share_kept(time, time_step) for time in network.filters]
         self.filters, self._factor = tuple(filters), factor
-        self._dead_band = nonlinear.get("dead_band")
-        self._backlash = nonlinear.get("backlash")
+        self._dead_band, self._backlash = nonlinear.get("dead_band"), nonlinear.get("backlash")
         self._zero, self._lower = nonlinear.get("zero"), nonlinear.get("lower", -math.inf)
         self._typical = typical
         self._slopes = {name: value for name, value in nonlinear.items() if name in SLOPES}

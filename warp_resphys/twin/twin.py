@@ -138,8 +138,7 @@ class Twin:
             self._check_unit(frame, belief)
         for interval in self._steps.values():
             self._forget(interval)
-        self._latest = time
-        self._origin = time
+        self._latest = self._origin = time
         self._newest = self._stale = 0
         self._again = self._framed = False
         self._commands = CommandSeries(commands, self._h)

@@ -92,8 +92,8 @@ def train_policy(settings: Policies, folder: Path) -> None:
         groups.setdefault(policy.group, []).append(policy)
     rows = list[list[str]]()
     for group, alike in groups.items():
-        errors = {world: [policy.errors[world] for policy in alike] for world in worlds}
-        rows.append([group, *map(_text, errors.values())])
+        of_group = [[policy.errors[world] for policy in alike] for world in worlds]
+        rows.append([group, *map(_text, of_group)])
     title = f"Mean error in mm, task {task}, {settings.episodes} episodes"
     if len(settings.seeds) > 1:
         title += f", policies of {len(settings.seeds)} seeds (lowest to highest)"

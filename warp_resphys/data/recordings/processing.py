@@ -66,7 +66,7 @@ def fill_gaps(recording: Recording, longest: int) -> Recording:
     return dataclasses.replace(recording, positions=positions)
 
 
-def _interpolated(series: FloatArray, old: FloatArray, new: FloatArray) -> FloatArray:
+def _interpolated(series: FloatArray, old: IntArray, new: FloatArray) -> FloatArray:
     """Interpolates a series (T, C) linearly at new places among its frames, (T', C)."""
     return np.stack([np.interp(new, old, channel) for channel in series.T], axis=1)
 

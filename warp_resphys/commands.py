@@ -269,8 +269,9 @@ def _groups() -> list[str]:
     """Help lines of the configuration groups: their options, including the user's own ones."""
     places = [Path(str(resources.files(CONFIG_PACKAGE))), Path.cwd() / OWN_OPTIONS]
     options: dict[str, set[str]] = {}
-    for path in [path for place in places for path in place.glob("*/*.yaml")]:
-        options.setdefault(path.parent.name, set()).add(path.stem)
+    for place in places:
+        for path in place.glob("*/*.yaml"):
+            options.setdefault(path.parent.name, set()).add(path.stem)
     return [f"{group}: {', '.join(sorted(names))}" for group, names in sorted(options.items())]
 
 

@@ -12,7 +12,7 @@ import torch
 from support.refusals import refuses
 from warp_resphys.control.controllers import JacobianFeedback
 from warp_resphys.control.linear_model import fit_linear
-from warp_resphys.control.plan import Planner, solve_program, tracked_of
+from warp_resphys.control.plan import Horizon, Planner, solve_program, tracked_of
 from warp_resphys.control.polynomials import Polynomial, SquaredPolynomial, best_order, powers
 from warp_resphys.control.reduced_force import Evaluator, ReducedForce
 from warp_resphys.control.reduced_model import ReducedModel
@@ -114,7 +114,11 @@ class TestPrograms:
                 return np.where(inputs > 0.6, np.nan, inputs)
 
         planner = Planner(
-            Model(), np.eye(1), LimitsOfInputs(low=0.0, high=1.0, rate=100.0), np.ones((4, 1)), 4, 1
+            Model(),
+            np.eye(1),
+            LimitsOfInputs(low=0.0, high=1.0, rate=100.0),
+            np.ones((4, 1)),
+            Horizon(4, 1),
         )
         # Half of the whole step.
         np.testing.assert_allclose(planner.plan(0, None)[-1], 0.5, rtol=0.1)
@@ -183,7 +187,8 @@ class TestBaselines:
         limits = LimitsOfInputs(low=0.0, high=1.0, rate=200.0)
 
         def error(wanted):
-            inputs = Planner(model, np.eye(6), limits, wanted, 30, 30, 1e-9, 2).plan(0, start)
+            horizon = Horizon(30, 30, 1e-9, 2)
+            inputs = Planner(model, np.eye(6), limits, wanted, horizon).plan(0, start)
             return np.abs(model.respond(start, inputs[:, None])[:, 0] - path)
 
         return model, path, error

@@ -20,7 +20,7 @@ from warp_resphys.data.registration import kabsch
 from warp_resphys.environments.making import TASKS, make_vector
 from warp_resphys.environments.policies import ScriptedGrasp, errors_mm
 from warp_resphys.environments.tasks import FollowTask, Reach, ReachTask
-from warp_resphys.environments.vector import ActionMapping, Camera, RobotVectorEnv
+from warp_resphys.environments.vector import ActionMapping, Camera, RobotVectorEnv, VectorOptions
 from warp_resphys.studies.live import LiveRobot
 
 QUICK = {"seconds": 0.2, "action_time": 0.05}  # four actions
@@ -198,13 +198,12 @@ def test_a_failure_in_any_step_of_an_action_ends_the_episode():
     np.testing.assert_allclose(
         infos[3]["error_mm"][0], 1e3 * np.linalg.norm(robots.task.goals[0, 0])
     )
-    for given, said in (
-        ({"forces": True}, "forces need a simulator"),
-        ({"squeeze": 0.1}, "squeeze is for fingers"),
+    for options, said in (
+        (VectorOptions(forces=True), "forces need a simulator"),
+        (VectorOptions(squeeze=0.1), "squeeze is for fingers"),
     ):
-        refuses(
-            InputError, said, RobotVectorEnv, Brittle(), robots.task, mapping, np.eye(3), 6, **given
-        )
+        arguments = (Brittle(), robots.task, mapping, np.eye(3), 6, options)
+        refuses(InputError, said, RobotVectorEnv, *arguments)
 
 
 @pytest.mark.slow

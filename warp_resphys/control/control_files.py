@@ -59,7 +59,8 @@ def plan_table(model: str, motion: str) -> str:
 def write_reduced(path: Path, model: ReducedModel) -> None:
     """Writes a reduced model without its network."""
     values = {field.name: getattr(model, field.name) for field in fields(model)}
-    if (force := values.pop("force")) is not None:
+    force = values.pop("force")
+    if force is not None:
         values |= {name: getattr(force, name) for name in _FORCE}
     acts = values["acts"].items()
     values["acts"] = {

@@ -21,7 +21,7 @@ from ..experiment.split_stages import SplitStages
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
-from ..io.parts import Arrays, Parts, Report, TrialPart
+from ..io.parts import Arrays, Report, TrialPart
 from ..io.progress import Progress
 from ..io.resuming import StageContext, finished_record
 from ..io.safe_files import write_json
@@ -164,10 +164,9 @@ def fit_baselines(context: StageContext) -> None:
     driven = driven_input(robot)
     data = Trials.read(context.run_dir / DATASET)
     assert driven.high is not None
-    train, validation = (
-        [_series(data, name, driven.name, robot.time_step) for name in names]
-        for names in (settings.split.train, settings.split.validation)
-    )
+    series = partial(_series, data, driven=driven.name, time_step=robot.time_step)
+    train = list(map(series, settings.split.train))
+    validation = list(map(series, settings.split.validation))
     linear = fit_linear(train, validation or train, np.asarray(driven.high), robot.time_step)
     feedback, limits = settings.control.feedback, settings.control.limits
     parts, steps = task.parts, max(round(feedback.settles / robot.time_step), 2)
@@ -227,7 +226,7 @@ def drive(context: StageContext, workers: Workers = ALONE) -> None:
                     partial(_driven, settings, context.run_dir, name, steps),
                 )
             )
-    parts = Parts.of(context, workers)
+    parts = context.parts(workers)
     parts.run(cut_up)
     motions = {}
     for part in cut_up:
@@ -257,7 +256,8 @@ def _driven(settings: StageSettings, folder: Path, name: str, steps: int, report
     """
     control = settings.control
     robot = load(folder, control.models[-1], settings.device)
-    task, driven, count = Task(control, robot), driven_input(robot), len(controllers_of(control))
+    task, driven = Task(control, robot), driven_input(robot)
+    count = len(controllers_of(control))
     laboratory = Laboratory(settings, folder, driven.name, count, motions_of(control).index(name))
     plans = {
         model: read_motion(folder / plans_file(model), PLANNED, name) for model in control.models
@@ -320,24 +320,20 @@ def _summary(
             name: 1e3 * np.linalg.norm(motions[name]["points"] - motions[name]["path"], axis=2)
             for name in names
         }
-        by_speed[f"{seconds:g}"] = {
-            controller: {
-                "mean_mm": float(np.mean([of_motion[row].mean() for of_motion in errors.values()])),
-                "max_mm": float(max(of_motion[row].max() for of_motion in errors.values())),
-                "motions_mm": {
-                    name: float(of_motion[row].mean()) for name, of_motion in errors.items()
-                },
+        of_speed: dict[str, TrackingErrors] = {}
+        for row, controller in enumerate(controllers):
+            of_motions = {name: of_motion[row] for name, of_motion in errors.items()}
+            of_speed[controller] = {
+                "mean_mm": float(np.mean([error.mean() for error in of_motions.values()])),
+                "max_mm": float(max(error.max() for error in of_motions.values())),
+                "motions_mm": {name: float(error.mean()) for name, error in of_motions.items()},
             }
-            for row, controller in enumerate(controllers)
-        }
+        by_speed[f"{seconds:g}"] = of_speed
     times = np.concatenate([motion["seconds"] for motion in motions.values()], axis=1)
-    planned: dict[str, dict[str, list[float]]] = {
-        model: {
-            name: read_motion(folder / plans_file(model), PLANNED, name)["errors_mm"].tolist()
-            for name in motions
-        }
-        for model in control.models
-    }
+    planned: dict[str, dict[str, list[float]]] = {}
+    for model in control.models:
+        plans = {name: read_motion(folder / plans_file(model), PLANNED, name) for name in motions}
+        planned[model] = {name: plan["errors_mm"].tolist() for name, plan in plans.items()}
     models: dict[str, ReducedErrors] = {
         model: read_quality(folder / reduced_file(model)) for model in control.models
     }

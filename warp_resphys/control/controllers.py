@@ -218,13 +218,11 @@ class JacobianFeedback:
         path: FloatArray,
         rest: FloatArray,
     ) -> None:
-        self.jacobian, self._limits, self._gain, self._step = (
-            jacobian * limits.range,
-            limits,
-            gain,
-            time_step,
-        )
-        self._tracked, self._path, self.last_seen = tracked, path, rest.ravel()
+        self.jacobian = jacobian * limits.range
+        self._limits = limits
+        self._gain, self._step = gain, time_step
+        self._tracked, self._path = tracked, path
+        self.last_seen = rest.ravel()
         self.shares = np.zeros(jacobian.shape[1])
         self._damping = _DAMPING * float(np.linalg.norm(self.jacobian, 2))
         self._window = max(round(_AVERAGED / time_step), 1)
@@ -238,7 +236,8 @@ class JacobianFeedback:
         point = self._tracked @ self.last_seen
         goal = self._path[max(number - 1, 0)]
         next_goal = self._path[number]
-        u, h, d = self.shares, self._step, len(point)
+        u, h = self.shares, self._step
+        d = len(point)
         self.past = np.concatenate([self.past, [np.concatenate([point, u])]])[-2 * self._window :]
         if len(self.past) == 2 * self._window:
             before, now = (window.mean(0) for window in np.split(self.past, 2))

@@ -13,6 +13,7 @@ model's in the next plan (iterative learning control).
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -37,6 +38,24 @@ _SHORTER: Final = 0.25  # factor on a correction that made the motion worse
 _PLAYED: Final = 3  # plans begin anew after one of so many parts of the horizon
 
 
+@dataclass(frozen=True)
+class Horizon:
+    """Length of a plan, and how finely it is found.
+
+    Attributes:
+        steps: H; past the end of the path, its last point is repeated.
+        pieces: of the piecewise linear inputs, from 1 to H.
+        weight: of the mean squares of the inputs, as shares of their ranges, and of their changes
+            between knots, as shares of the rate limits, beside squared distances in millimetres.
+        iterations: of Gauss-Newton, at most.
+    """
+
+    steps: int
+    pieces: int
+    weight: float = 1e-2
+    iterations: int = 1
+
+
 class Planner:
     """Plans over a horizon along a path; each begins where the last one was left.
 
@@ -45,11 +64,7 @@ class Planner:
         tracked: (d, 3 M) from the observed points to the coordinates that follow the path.
         limits: of each input; the first plan begins at the lower ones.
         path: (T, d) reference of the points after each step [m], NaN where they are free.
-        steps: H, of the horizon; past the end of the path, its last point is repeated.
-        pieces: of the piecewise linear inputs, from 1 to H.
-        weight: of the mean squares of the inputs, as shares of their ranges, and of their changes
-            between knots, as shares of the rate limits, beside squared distances in millimetres.
-        iterations: of Gauss-Newton, at most.
+        horizon: of H steps.
     """
 
     def __init__(
@@ -58,13 +73,13 @@ class Planner:
         tracked: FloatArray,
         limits: LimitsOfInputs,
         path: FloatArray,
-        steps: int,
-        pieces: int,
-        weight: float = 1e-2,
-        iterations: int = 1,
+        horizon: Horizon,
     ) -> None:
-        self.model, self.tracked, self.limits, self.path = model, tracked, limits, path
-        self.steps, self._weight, self._iterations = steps, weight, iterations
+        self.model, self.limits = model, limits
+        self.tracked, self.path = tracked, path
+        self.steps = steps = horizon.steps
+        pieces = horizon.pieces
+        self._weight, self._iterations = horizon.weight, horizon.iterations
         ends = np.arange(1, steps + 1) / steps * pieces  # of the steps, in pieces
         self._lines = np.maximum(1.0 - np.abs(ends[:, None] - np.arange(pieces + 1.0)), 0.0)
         self._most = limits.rate * (steps * model.time_step / pieces) / limits.range
@@ -248,12 +263,8 @@ def follow(
         errors.append(1e3 * np.linalg.norm(points - paths, axis=2).mean(1))
         for row, error in enumerate(errors[-1]):
             if error < best[row]:
-                best[row], kept[row], kept_markers[row], shares[row] = (
-                    error,
-                    inputs[row],
-                    markers[row],
-                    1.0,
-                )
+                best[row], shares[row] = error, 1.0
+                kept[row], kept_markers[row] = inputs[row], markers[row]
                 offset = points[row] - model.respond(start, inputs[row][:, None])[:, 0] @ tracked.T
                 wanted[row] = _planned(model, planner_of(paths[row]), offset)
             else:

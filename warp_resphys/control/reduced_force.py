@@ -35,10 +35,8 @@ class Evaluator:
 
     def __init__(self, network: StateMap, range_: Range | None) -> None:
         assert isinstance(network.network, SkipMLP)
-        self._blocks = [
-            [_layer(layer) for layer in cast(nn.Sequential, block)]
-            for block in network.network.blocks
-        ]
+        blocks = [cast(nn.Sequential, block) for block in network.network.blocks]
+        self._blocks = [list(map(_layer, block)) for block in blocks]
         self._linear, self._remainder = (
             network.linear.numpy(force=True),
             network.remainder.numpy(force=True),

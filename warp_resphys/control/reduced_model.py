@@ -281,7 +281,8 @@ class ReducedModel:
         acting, means, memory = self.response(start.memory, inputs)
         acting, means = self._moving(acting), self._moving(means)
         steps, batch, n = acting.shape
-        u, r, h = Monomials(acting.reshape(-1, n)), self.modes, self.time_step
+        u = Monomials(acting.reshape(-1, n))
+        r, h = self.modes, self.time_step
         back = np.repeat(start.looks_back[None] & (self.integrator == "bdf2"), steps, axis=0)
         back[1:] = self.integrator == "bdf2"
         share = np.where(back, 1.0 / 3.0, 0.0).reshape(-1, 1)  # g
@@ -295,7 +296,8 @@ class ReducedModel:
         shifted = base if bias is None else (base.reshape(steps, batch, r) + bias).reshape(-1, r)
         pull = (a @ shifted[..., None])[..., 0]
         force = self._force(u, means.reshape(len(means), len(u.points), n))
-        now, before, states = np.stack([start.z, start.v]), start.previous, list[FloatArray]()
+        now, before = np.stack([start.z, start.v]), start.previous
+        states = list[FloatArray]()
         strain, left = start.strains, start.left
         for k in range(steps):
             rows = slice(k * batch, (k + 1) * batch)
@@ -335,7 +337,8 @@ class ReducedModel:
             bias: (r,) added to the equilibria z_0.
         """
         batch = inputs.shape[1]
-        z, u, _ = self.move(start.select([0] * batch) if len(start.z) == 1 else start, inputs, bias)
+        starts = start.select([0] * batch) if len(start.z) == 1 else start
+        z, u = self.move(starts, inputs, bias)[:2]
         return self.points(z.reshape(-1, self.modes), u).reshape(len(z), batch, -1)
 
     @cached_property

@@ -251,14 +251,14 @@ def _subspace(
     shapes = torch.stack([tangent.shapes for tangent in tangents])
     basis = _common(shapes, source.mass)
     projector = source.mass[:, None] * basis
-    left, _, right = np.linalg.svd(torch.einsum("dr,sdk->srk", projector, shapes).cpu().numpy())
+    turns = np.linalg.svd(torch.einsum("dr,sdk->srk", projector, shapes).cpu().numpy())
     z_statics = ((statics.q - source.rest).flatten(1).double() @ projector).cpu().numpy()
     z, rates = (
         torch.einsum("tbd,dr->tbr", field.flatten(2).double(), projector).cpu().numpy()
         for field in (motions.q - source.rest.float(), motions.v)
     )
     # T is nearly orthogonal, but singular where a vibration leaves the subspace.
-    return _Subspace(basis, shapes, left @ right, z_statics, z, rates)
+    return _Subspace(basis, shapes, turns.U @ turns.Vh, z_statics, z, rates)
 
 
 def _assembled(
@@ -336,7 +336,8 @@ def _reduced_force(
     """
     if statics.outputs is None or source.learned is None:
         return None, np.zeros_like(space.statics)
-    u, network, back = statics.u, source.learned.network, space.turned.mT
+    u, back = statics.u, space.turned.mT
+    network = source.learned.network
     push = fitted(
         space.turned @ np.stack([tangent.push for tangent in tangents if tangent.push is not None])
     )
@@ -378,8 +379,8 @@ def _common(shapes: torch.Tensor, mass: torch.Tensor) -> torch.Tensor:
     root = mass.sqrt()[:, None]
     columns = (root * shapes).permute(1, 0, 2).flatten(1)
     basis = torch.linalg.svd(columns, full_matrices=False)[0][:, : shapes.shape[2]]
-    left, _, right = torch.linalg.svd(basis.mT @ (root * shapes[0]))
-    return torch.where(root > 0.0, basis @ left @ right / root.clamp_min(1e-300), 0.0)
+    turn = torch.linalg.svd(basis.mT @ (root * shapes[0]))
+    return torch.where(root > 0.0, basis @ turn.U @ turn.Vh / root.clamp_min(1e-300), 0.0)
 
 
 def _with_output(
@@ -421,7 +422,8 @@ def _errors(
     for number, now in enumerate(commands):
         memories.append(model.response(memories[-1], now[None])[2])
         strains.append(model.relaxed(strains[-1], z[number + 1] - z[number]))
-    off, moved, looks = [], [], np.ones(z.shape[1], dtype=np.bool_)
+    off, moved = [], []
+    looks = np.ones(z.shape[1], dtype=np.bool_)
     for at in range(2, len(commands) - steps, max(steps // 3, 1)):
         before = np.stack([z[at - 1], rates[at - 1]])
         start = ReducedState(

@@ -26,9 +26,10 @@ OnProgress = Callable[[int], None]
 _OF_MEDIUM: Final = ("added_layer", "drag_linear", "drag_normal", "drag_tangential")
 _MORE_MODES: Final = 1.5  # computed vibrations per kept one, so that the slowest are accurate
 _MEAN, _DEVIATION = 0.4, 0.45  # of sampled inputs, as shares of their range
-# Correlation times of the inputs [s]: the shortest in motions for fitting, the shortest in those
-# for the error, and the longest in both.
-_FASTEST, _FAST, _SLOWEST = 0.05, 0.25, 0.45
+# Correlation times of the inputs [s].
+_FASTEST = 0.05  # the shortest in motions for fitting
+_FAST = 0.25  # the shortest in motions for the error
+_SLOWEST = 0.45  # the longest in both
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,8 @@ class Source:
     """
 
     def __init__(self, robot: Robot, driven: RobotInput) -> None:
-        self.robot, self.input, simulator = robot, driven, robot.simulator
+        self.robot, self.input = robot, driven
+        simulator = robot.simulator
         self.parts, self.rest = len(driven.parts), simulator.rest_positions
         self.learned: Learned | None = robot.description.learned
         self.filters = robot.description.filters if self.learned is not None else ()
@@ -327,7 +329,8 @@ class Source:
         """Linearises about an equilibrium (1, N, 3) under commands (n,)
         and the force of network outputs (c,).
         """
-        robot, still, keywords = self.robot, torch.zeros_like(q), self.keywords(commands[None])
+        robot, still = self.robot, torch.zeros_like(q)
+        keywords = self.keywords(commands[None])
         state = robot.state(q, **keywords)
         hessian, inertia, free = linearised(self._elastic, state, **keywords)
         stiffness = (hessian - inertia).tocsc()

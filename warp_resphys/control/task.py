@@ -17,15 +17,15 @@ from ..io.errors import InputError
 from ..robot.robot import Robot
 from ..settings.control import FigureSettings
 from .linear_model import LinearModel
-from .plan import Planner, tracked_of
+from .plan import Horizon, Planner, tracked_of
 from .polynomials import around
 from .reduced_model import ReducedModel
 from .sampling import driven_input
 
 _POINTS = 40  # number of points of a path whose reach is checked
 _SPACING = 0.05  # between knots of the inputs of a plan [s]
-# Of plans of whole motions: horizon [s], weight, and iterations.
-_AHEAD, _WEIGHT, _ITERATIONS = 0.3, 1e-3, 3
+_AHEAD = 0.3  # horizon of plans of whole motions [s]
+_WEIGHT, _ITERATIONS = 1e-3, 3  # of these plans
 _CHANGE = 1e-3  # of the inputs for derivatives of an equilibrium, as a share of their ranges
 _LEAST_PIECES = 3  # of the inputs in a receding horizon
 _RESOLUTION: Final = 2000  # number of points of a path
@@ -131,10 +131,8 @@ def _curve(name: str) -> FloatArray:
         return _even(np.stack([np.sin(2.0 * angle) / 2.0, np.cos(angle)], axis=1))
     if name not in _LETTERS:
         raise InputError(f"the path is {name!r}: choose circle, eight, or a capital letter.")
-    corners = np.array(
-        [[float(x) for x in (at.split(",") if "," in at else at)] for at in _LETTERS[name].split()]
-    )
-    straight = _even(corners)
+    corners = [at.split(",") if "," in at else [*at] for at in _LETTERS[name].split()]
+    straight = _even(np.array(corners, dtype=np.float64))
     return _even(gaussian_filter1d(straight, _CORNER * _RESOLUTION / 2.0, axis=0, mode="nearest"))
 
 
@@ -175,7 +173,8 @@ class Task:
     """
 
     def __init__(self, figures: FigureSettings, robot: Robot) -> None:
-        self.figures, self._labels, self.time_step = figures, robot.labels, robot.time_step
+        self.figures = figures
+        self._labels, self.time_step = robot.labels, robot.time_step
         self.parts = len(driven_input(robot).parts)
 
     @cached_property
@@ -215,9 +214,8 @@ class Task:
         """
         steps = max(round(horizon / self.time_step), 1)
         pieces = min(max(round(steps * self.time_step / _SPACING), _LEAST_PIECES), steps)
-        return Planner(
-            model, self.tracked, self.figures.limits, path, steps, pieces, weight, iterations
-        )
+        plan = Horizon(steps, pieces, weight, iterations)
+        return Planner(model, self.tracked, self.figures.limits, path, plan)
 
     def check_reach(self, model: ReducedModel, reach: float) -> None:
         """Checks that the robot has an equilibrium at every point of the paths.
@@ -231,16 +229,15 @@ class Task:
         """
         for path in self.paths:
             curve = path.points
-            worst, shown, guess = 0.0, (curve[0], curve[0]), None
+            worst, guess = 0.0, None
+            shown = curve[0], curve[0]
             for point in curve[:: max(len(curve) // _POINTS, 1)]:
                 guess, near = self._nearest(model, point, guess)
                 distance = float(np.linalg.norm(near - point))
                 if distance > worst:
                     worst, shown = distance, (point, near)
             if worst > reach:
-                wanted, reached = (
-                    "(" + ", ".join(f"{1e3 * x:.1f}" for x in point) + ")" for point in shown
-                )
+                wanted, reached = map(_shown_mm, shown)
                 raise InputError(
                     f"the robot cannot reach the path {path.name}: the reachable point nearest "
                     f"to {wanted} mm is {reached} mm, {1e3 * worst:.1f} mm away. Change "
@@ -274,6 +271,11 @@ class Task:
         ]
         best = min(searches, key=lambda search: search.cost).x
         return best, places(best[None])[0]
+
+
+def _shown_mm(point: FloatArray) -> str:
+    """Returns the coordinates of a point [m] in millimetres, in brackets."""
+    return "(" + ", ".join(f"{1e3 * x:.1f}" for x in point) + ")"
 
 
 def motions_of(figures: FigureSettings, *durations: float) -> list[str]:

@@ -169,10 +169,12 @@ class RobotWorld(World[State]):
                 "spread needs: set spread=0, or choose a run that identifies parameters."
             )
         self._nominal = self.robot = robot
-        self.count, self.time_step, self.input = count, time_step or robot.time_step, command
+        self.count, self.input = count, command
+        self.time_step = time_step or robot.time_step
         self._substeps = round(self.time_step / robot.time_step)
         self._mixed = np.eye(len(robot.inputs[command].parts)) if mixed is None else mixed
-        self.parts, self._spread, self._shown = len(self._mixed), spread, shown
+        self.parts = len(self._mixed)
+        self._spread, self._shown = spread, shown
         self.rest = self._begun()
 
     @override
@@ -302,10 +304,8 @@ class Laboratory(RobotWorld):
         trials = read_json(run_dir / REGISTRATION).values()
         reference = make_setup(settings).reference
         seen = [trial["positions"] for trial in trials if "positions" in trial]
-        places = np.mean(
-            [[places_of[label] for label in settings.binding.reference] for places_of in seen],
-            axis=0,
-        )
+        labels = settings.binding.reference
+        places = np.mean([list(map(trial.__getitem__, labels)) for trial in seen], axis=0)
         # From the frame of the body to that of the experiment.
         self._frame = kabsch(reference, places)
 
@@ -346,8 +346,9 @@ class ReducedWorld(World[ReducedState]):
     """B copies of a robot's reduced model, a few hundred times as fast as its simulator."""
 
     def __init__(self, model: ReducedModel, count: int) -> None:
-        self._model, self.count, self.time_step = model, count, model.time_step
-        self.input, self.parts, self.rest = model.name, model.parts, model.rest(count=count)
+        self._model, self.count = model, count
+        self.time_step, self.input = model.time_step, model.name
+        self.parts, self.rest = model.parts, model.rest(count=count)
         self._furthest = _FURTHEST * np.abs(model.static.coefficients).max()
 
     @override

@@ -21,11 +21,8 @@ class GeomSurfaces:
     """
 
     def __init__(self, model: Any) -> None:
-        self._points, triangles, first = (
-            dict[int, FloatArray](),
-            [np.zeros((0, 3), dtype=np.int64)],
-            0,
-        )
+        self._points = dict[int, FloatArray]()
+        triangles, first = [np.zeros((0, 3), dtype=np.int64)], 0
         for geom, size in enumerate(model.geom_size):
             solid = _solid(int(model.geom_type[geom]), *size)
             if solid is not None:

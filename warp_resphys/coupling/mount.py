@@ -238,9 +238,8 @@ class Mount:
         """
         count, h = len(state.arm), self.time_step
         controls = self._controls(ctrl, count)
-        before, mobility = (
-            np.stack(x) for x in zip(*(self._body.place(row) for row in state.arm), strict=True)
-        )
+        placed = map(self._body.place, state.arm)
+        before, mobility = map(np.stack, zip(*placed, strict=True))
         turn, past = _turns(before)[:, None], state.accelerations
         response = turn @ state.response @ _transposed(turn)
         remainder = 2.0 * state.remainder[:, 0] - state.remainder[:, 1]
@@ -251,10 +250,8 @@ class Mount:
             """Returns arms (E, S), frames (E, 7), twists (E, 6)
             and expected reactions (E, 6) after the step.
             """
-            rows = zip(state.arm, controls, wrench, strict=True)
-            arm, frame = (
-                np.stack(x) for x in zip(*(self._body.advance(*row) for row in rows), strict=True)
-            )
+            advanced = map(self._body.advance, state.arm, controls, wrench)
+            arm, frame = map(np.stack, zip(*advanced, strict=True))
             velocity = twist(before, frame, h)
             return (
                 arm,

@@ -62,7 +62,8 @@ def base_pose(model: Any, data: Any, body: str, pose: ArrayLike = HERE) -> Float
     rotation, shift = pose_of("the robot on its body", pose)
     mujoco, number = mujoco_package(), _number(model, body)
     own = mujoco.MjData(model)
-    own.qpos[:], own.mocap_pos[:], own.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
+    own.qpos[:] = data.qpos
+    own.mocap_pos[:], own.mocap_quat[:] = data.mocap_pos, data.mocap_quat
     mujoco.mj_kinematics(model, own)
     placed = own.body(number)
     turned = placed.xmat.reshape(3, 3)
@@ -175,7 +176,8 @@ class MountingBody:
                 f"the model is a {type(model).__name__}: "
                 "give a mujoco.MjModel, as from `from_xml_path`."
             )
-        self.model, self._body, self._time_step = model, _number(model, body), time_step
+        self.model, self._time_step = model, time_step
+        self._body = _number(model, body)
         rotation, self._shift = pose_of("the robot on its body", pose)
         _check_movable(model, body, pose)
         ratio = time_step / model.opt.timestep
@@ -256,7 +258,8 @@ class MountingBody:
 
     def _ahead(self) -> FloatArray:
         """Returns the frame (7,) of the base, tau ahead of the positions in the data."""
-        origin, turn, swing = self._origin(self._data), np.empty(4), np.empty(4)
+        origin = self._origin(self._data)
+        turn, swing = np.empty(4), np.empty(4)
         self._mujoco.mju_mulQuat(turn, self._data.xquat[self._body], self._turn)
         if self._substeps > 1:
             moved = (

@@ -286,11 +286,9 @@ class PlacedCamera:
             corrections: (9,).
             tangents: (K, P, 3) motions of the points by K parameters [m].
         """
-        turn, (lens, middle), seen = (
-            rotations(corrections[3:6]),
-            self._seen_through(),
-            self.seen_from(points, corrections),
-        )
+        turn = rotations(corrections[3:6])
+        lens, middle = self._seen_through()
+        seen = self.seen_from(points, corrections)
         by_place = corrections[6] * jacobians(lens.pixels, seen)[0] @ self.pose[:3, :3]
         turned = torch.autograd.functional.jacobian(rotations, corrections[3:6])  # (3, 3, 3)
         by_turn = by_place @ torch.einsum("ijk,pj->pik", turned, points - self.centre)
@@ -375,7 +373,7 @@ def motion_axes(gravity: FloatArray, positions: FloatArray) -> FloatArray:
     up = upwards(gravity)
     points = positions[np.isfinite(positions).all(axis=2)]
     flat = points - np.outer(points @ up, up)
-    _, _, directions = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
+    directions = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False).Vh
     right = directions[0] - (directions[0] @ up) * up
     right /= np.linalg.norm(right)
     moved = np.nanmax(np.linalg.norm(positions - positions[0], axis=2), axis=0)  # (N,)

@@ -28,7 +28,8 @@ def time_since_change(times: FloatArray, inputs: Sequence[FloatArray]) -> FloatA
         return np.full_like(times, np.inf)
     last = np.broadcast_to(times[0], times.shape).copy()
     for values in inputs:
-        limit, kept, changed = _SAME * np.abs(values).max(0), values[0].copy(), times[0].copy()
+        limit = _SAME * np.abs(values).max(0)
+        kept, changed = values[0].copy(), times[0].copy()
         for frame in range(1, len(times)):
             leaves = np.abs(values[frame] - kept) > limit
             kept = np.where(leaves, values[frame], kept)

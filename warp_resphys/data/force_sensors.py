@@ -73,7 +73,8 @@ class ForceSensor(Brief):
             raise InputError(
                 f"axes of a force sensor is {self.axes!r}: give a tuple, such as ({self.axes!r},)."
             )
-        if not self.axes or (unknown := [axis for axis in self.axes if axis not in AXES]):
+        unknown = [axis for axis in self.axes if axis not in AXES]
+        if unknown or not self.axes:
             named = f"has the axis {unknown[0]!r}" if self.axes else "has no axes"
             raise InputError(f"a force sensor {named}: name some of {', '.join(AXES)}.")
         for name in ("noise", "moment_noise", "zero", "drift"):
@@ -166,7 +167,7 @@ class ForceSensor(Brief):
         known = seen.to(errors)[..., None]  # (R, T, 6, 1)
         unknown = torch.stack([torch.full_like(times, self.zero), self.drift * times], -1)
         columns = (known * unknown[:, :, None]).transpose(1, 2)  # (R, 6, T, 2)
-        basis, sizes, _ = torch.linalg.svd(columns, full_matrices=False)
+        basis, sizes = torch.linalg.svd(columns, full_matrices=False)[:2]
         kept = (1.0 - (1.0 + sizes.square()).rsqrt())[..., None]
         flat = errors.transpose(2, 3)[..., None]  # (E, R, 6, T, 1)
         return (flat - basis @ (kept * (basis.mT @ flat)))[..., 0].transpose(2, 3)

@@ -45,11 +45,8 @@ class InputNetwork(torch.nn.Module):
         basis: torch.Tensor,
     ) -> None:
         super().__init__()
-        self.filters, self.unit, self.parts = (
-            tuple(filters),
-            unit,
-            centres.shape[1] // (1 + len(filters)),
-        )
+        self.filters, self.unit = tuple(filters), unit
+        self.parts = centres.shape[1] // (1 + len(filters))
         for name, x in {
             "centres": centres,
             "mean": mean,

@@ -64,7 +64,8 @@ def draw_inputs(
         InputError: there is no time between the rests, or the correlations are not those of a
             distribution.
     """
-    at, rest, scale = time_step * np.arange(steps + 1), sequences.rest, sequences.correlation_time
+    at = time_step * np.arange(steps + 1)
+    rest, scale = sequences.rest, sequences.correlation_time
     inside = (at >= rest - 1e-9) & (at <= at[-1] - rest + 1e-9)
     if inside.sum() < 3:
         raise InputError(
@@ -168,21 +169,19 @@ class InputResponse:
         factor: on the commands; None for no factor.
         delay: zero or more [s], not differentiable at whole numbers of steps; None for no delay.
         rise: time constant of the lag [s]; None for no lag.
-        slew: reciprocal of the slew rate [s/unit], the largest change of the input in a second, as
-            of a valve whose flow is choked. None or zero for no limit.
-        dead_band: largest command without an effect, as of a tendon that hangs slack; larger ones
-            act less by it. Zero or more. None for none.
-        zero: command at which nothing acts, as of a gauge or a winch that was not zeroed; None for
-            zero.
-        backlash: fall of the commands after which they act again when they turn back, as of gears
-            that are loaded in one direction; at rest, commands have risen to their values. Zero or
-            more. None for none.
-        lower: least input; with a zero, lower ones count as this one.
         typical: typical command, which the octaves of the characteristic curve follow.
         filters: F time constants of the exponential means [s].
         network: changes the input further; None for no change.
-        slopes: of the characteristic curve by the names in `SLOPES`; those left out are one.
-            `_curved` describes it. A straight line without any.
+        nonlinear: by name; None, or left out, for no effect. ``slew`` is the reciprocal of the slew
+            rate [s/unit], the largest change of the input in a second, as of a valve whose flow is
+            choked; zero for no limit. ``dead_band`` is the largest command without an effect, as of
+            a tendon that hangs slack; larger ones act less by it. Zero or more. ``zero`` is the
+            command at which nothing acts, as of a gauge or a winch that was not zeroed.
+            ``backlash`` is the fall of the commands after which they act again when they turn back,
+            as of gears that are loaded in one direction; at rest, commands have risen to their
+            values. Zero or more. ``lower`` is the least input; with a zero, lower ones count as
+            this one. Slopes of the characteristic curve have the names in `SLOPES`; those left out
+            are one. `_curved` describes it.
     """
 
     def __init__(
@@ -191,22 +190,20 @@ class InputResponse:
         factor: Number = None,
         delay: Number = None,
         rise: Number = None,
-        slew: Number = None,
-        dead_band: Number = None,
-        zero: Number = None,
-        backlash: Number = None,
-        lower: float = -math.inf,
         typical: float = 1.0,
         filters: Sequence[float] = (),
         network: InputNetwork | None = None,
-        **slopes: Number,
+        **nonlinear: Number,
     ) -> None:
         self._network, self._kept_felt = network, list[Array]()
         if network is not None:
             self._kept_felt = [_share_kept(time, time_step) for time in network.filters]
-        self.filters, self._factor, self._dead_band = tuple(filters), factor, dead_band
-        self._typical, self._slopes = typical, slopes
-        self._zero, self._backlash, self._lower = zero, backlash, lower
+        self.filters, self._factor = tuple(filters), factor
+        self._dead_band, self._backlash = nonlinear.get("dead_band"), nonlinear.get("backlash")
+        self._zero, self._lower = nonlinear.get("zero"), nonlinear.get("lower", -math.inf)
+        self._typical = typical
+        self._slopes = {name: value for name, value in nonlinear.items() if name in SLOPES}
+        slew = nonlinear.get("slew")
         self._late = None if delay is None else delay / time_step
         self._length = 0 if self._late is None else int(_whole(self._late).max()) + 1
         follows = rise is not None or slew is not None
@@ -347,7 +344,8 @@ def response_of(
         of_parts = [parameters.get(f"{name}_{part}") for part in parts]
         if name in parameters:
             known[word] = parameters[name]
-        if (one := next((value for value in of_parts if value is not None), None)) is not None:
+        one = next((value for value in of_parts if value is not None), None)
+        if one is not None:
             common = known.get(word, 0.0 * one + (1.0 if word in UNITS else 0.0))
             values = [common if value is None else value for value in of_parts]
             like = _library(one)

@@ -58,9 +58,7 @@ class MarkerView:
         if not self.shape_alone:
             return
         if self.sets:
-            if len({marker for members in self.sets for marker in members}) < sum(
-                map(len, self.sets)
-            ):
+            if len(set().union(*self.sets)) < sum(map(len, self.sets)):
                 raise InputError(
                     "markers.frame is own, but two trials have some markers in common, and not "
                     "all: they must have the same ones, or none in common."

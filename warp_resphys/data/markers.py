@@ -367,14 +367,16 @@ def bind_markers(
     flat = np.array(kinds) == "normal"
     parts = list[SurfaceMarkers | RigidMarkers]()
     places = list[list[int]]()
-    if len(surface := np.flatnonzero(flat | (np.array(kinds) == "frame"))):
+    surface = np.flatnonzero(flat | (np.array(kinds) == "frame"))
+    if len(surface):
         parts.append(
             _on_triangles(
                 mesh, feet.triangles[surface], points[surface], feet.points[surface], flat[surface]
             )
         )
         places.append(surface.tolist())
-    if rigid := [number for number, name in enumerate(kinds) if name == "rigid"]:
+    rigid = [number for number, name in enumerate(kinds) if name == "rigid"]
+    if rigid:
         parts.append(follow_vertices(mesh, vertices, points[rigid]))
         places.append(rigid)
     for number in [number for number, name in enumerate(kinds) if name == "patch"]:

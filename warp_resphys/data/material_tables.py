@@ -55,7 +55,7 @@ _SPELLED: Final = {
 } | dict.fromkeys(("mm/mm", "m/m", "in/in", "-", "\u2013"), "1")
 _CELL: Final = re.compile(r"(.*?)[\s_]*(?:[\[(](?:in )?(.*)[\])])?")
 _SUFFIX: Final = re.compile(r"(\w+?)(?:_|\s*/\s*)([^\s_/]+)")  # Force_N, Kraft / N
-_ALL_UNITS: Final = {*_SPELLED, *(unit for units in _UNITS.values() for unit in units)}
+_ALL_UNITS: Final = {*_SPELLED}.union(*_UNITS.values())
 _PAIRS: Final = (("strain", "displacement", "stretch"), ("stress", "force"))
 
 
@@ -116,12 +116,14 @@ def _meanings(
     named: Mapping[int, str], rows: Rows, by_header: bool, path: Path
 ) -> tuple[dict[int, str], dict[int, float], str | None]:
     """Quantities and factors to SI units by column, and the header of a strain without a unit."""
-    factors, names, bare = dict[int, float](), dict[int, str](), None
+    factors, names = dict[int, float](), dict[int, str]()
+    bare = None
     cells = {column: _name_and_unit(cell) for column, cell in named.items()}
     words = [name for name, _ in cells.values()]
     for column, (word, unit) in cells.items():
         name = word if _SYNONYMS.get(word, word) in words else _SYNONYMS.get(word, word)
-        if (known := _UNITS.get(name)) is None:
+        known = _UNITS.get(name)
+        if known is None:
             if by_header:
                 continue
             raise DataFileError(
@@ -149,9 +151,8 @@ def _meanings(
         names[column], factors[column] = name, known[unit or "1"]
         bare = named[column] if name == "strain" and not unit else bare
     for pair in _PAIRS:
-        if (present := [name for name in pair if name in names.values()]) != present[
-            :1
-        ] or not present:
+        present = [name for name in pair if name in names.values()]
+        if len(present) != 1:
             raise DataFileError(
                 f"{path} has {len(present)} of the columns {' and '.join(pair[:2])}, of which a "
                 f"test has one. It has {listed([*named.values()])}: name them in its header, as "
@@ -166,7 +167,8 @@ def _numbers(
     """Returns the columns of the lines with numbers."""
     header = rows[first - 1] if first else []
     width = len(header) if any(header) else max(map(len, rows[first : first + 1]), default=0)
-    values, lines, lost = list[list[float]](), list[int](), list[int]()
+    values = list[list[float]]()
+    lines, lost = list[int](), list[int]()
     for line, row in enumerate(rows[first:], start=first + 1):
         if not any(row):
             continue
@@ -286,31 +288,35 @@ def read_membrane(path: Path) -> MembraneTable:
     names = [name.strip().removesuffix("_mm") for name in head.lstrip("# ").split(",")]
     values = [number(cell) for cell in tail.strip(" []").split(",")]
     sizes = {name: value for name, value in zip(names, values, strict=False) if value is not None}
-    if lost := [name for name in _MEMBRANE if name not in sizes]:
+    lost = [name for name in _MEMBRANE if name not in sizes]
+    if lost:
         raise DataFileError(
             f"{path}, line 1 has no {lost[0]}_mm: begin the table of a membrane with '# "
             f"{'_mm,'.join(_MEMBRANE)}_mm = [2.0, 25.4, nan, nan, nan, nan]'."
         )
     header = [cell.strip() for cell in lines[1].split(",")] if len(lines) > 1 else []
-    if lost := [name for name in _LIFTED if name not in header]:
+    lost = [name for name in _LIFTED if name not in header]
+    if lost:
         raise DataFileError(
             f"{path}, line 2 has no column {lost[0]}: name the columns {', '.join(_LIFTED)}."
         )
-    rows = [[number(cell) for cell in line.split(",")] for line in lines[2:] if line.strip()]
-    if bad := [k for k, row in enumerate(rows, start=3) if len(row) != len(header) or None in row]:
-        raise DataFileError(
-            f"{path}, line {bad[0]}: give a number for each of the columns {', '.join(header)}."
-        )
+    written = [line for line in lines[2:] if line.strip()]
+    rows = [list(map(number, line.split(","))) for line in written]
+    for line, row in enumerate(rows, start=3):
+        if len(row) != len(header) or None in row:
+            raise DataFileError(
+                f"{path}, line {line}: give a number for each of the columns {', '.join(header)}."
+            )
     table = np.array(rows, dtype=np.float64).reshape(-1, len(header))
-    height, pressure, force = (table[:, header.index(name)] for name in _LIFTED)
+    columns = {name: table[:, header.index(name)] for name in _LIFTED}
     rings = [(1e-3 * sizes[f"ring{k}_radius"], 1e-3 * sizes[f"ring{k}_width"]) for k in (1, 2)]
     return MembraneTable(
         thickness=1e-3 * sizes["thickness"],
         cap=1e-3 * sizes["contact_radius"],
         rings=tuple(ring for ring in rings if np.isfinite(ring).all()),
-        height=1e-3 * height,
-        pressure=pressure,
-        force=force,
+        height=1e-3 * columns["height_mm"],
+        pressure=columns["pressure_Pa"],
+        force=columns["lifted_force_N"],
     )
 
 
@@ -363,8 +369,7 @@ def _header(rows: Rows, path: Path) -> tuple[int, dict[int, str]]:
             f"{path} has no line of numbers below a header: "
             "export it as CSV, with names of its columns."
         )
-    _, _, start, cells = max(found, key=lambda one: one[:2])
-    return start, cells
+    return max(found, key=lambda one: one[:2])[2:]
 
 
 def _has_numbers(row: Sequence[str]) -> bool:
@@ -379,7 +384,8 @@ def _described(rows: Rows, table: TableSettings, path: Path) -> tuple[int, dict[
             column: cell for column, cell in enumerate(table.columns) if cell
         }
     header = rows[table.header_lines] if len(rows) > table.header_lines else []
-    if lost := [name for name in table.names if header.count(name) != 1]:
+    lost = [name for name in table.names if header.count(name) != 1]
+    if lost:
         known = (
             did_you_mean(lost[0], header)
             or f"; it has {listed([cell for cell in header if cell])}."

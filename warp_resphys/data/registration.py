@@ -164,7 +164,8 @@ def register_markers(
     used = _used(
         a, b, names, use, source, 1 if rotation is not None else 3 if vertical is None else 2
     )
-    fewest, turned, shown = max(4, len(used) // 2 + 1), None, ""
+    fewest = max(4, len(used) // 2 + 1)
+    turned, shown = None, ""
     if rotation is not None:
         fewest, turned = len(used) // 2 + 1, np.asarray(rotation, dtype=np.float64)
         shown = " with the axes that are given"
@@ -210,7 +211,8 @@ def _used(
             f"{len(names)} markers are named, with measured positions {a.shape} and nominal ones "
             f"{b.shape}: both must be (markers, 3)."
         )
-    if unknown := [name for name in use or () if name not in names]:
+    unknown = [name for name in use or () if name not in names]
+    if unknown:
         raise InputError(
             f"Registration should use {listed(unknown)}, but the markers are {listed(names)}."
         )

@@ -27,7 +27,7 @@ from ..settings.performed import CORNERS
 from .recordings.recording import ARM, Recording
 from .registration import RigidTransform, fit
 
-_SIGNS = np.array([[1.0 if sign == "+" else -1.0 for sign in corner] for corner in CORNERS])
+_SIGNS = np.where(np.array([[*corner] for corner in CORNERS]) == "+", 1.0, -1.0)
 
 
 def arms(length: float) -> FloatArray:
@@ -78,8 +78,8 @@ def with_axes(recording: Recording, lengths: Mapping[str, float]) -> Recording:
     """Returns a recording with the points that motion capture gives
     in place of those of `with_corners`.
     """
-    labels, positions, rest = [*recording.labels], recording.positions.copy(), recording.rest
-    rest = None if rest is None else rest.copy()
+    labels, positions = [*recording.labels], recording.positions.copy()
+    rest = None if recording.rest is None else recording.rest.copy()
     for name, rows in corners_of(labels).items():
         weights = ARM / (4.0 * np.sqrt(0.5) * lengths[name]) * _SIGNS.T
         for points in (positions, rest):

@@ -248,20 +248,12 @@ class Trials(Brief):
                 "base",
             )
         }
-        named = {
-            key: {
-                name: np.concatenate([values, getattr(other, key)[name]])
-                for name, values in getattr(self, key).items()
-            }
-            for key in ("inputs", *_GROUPS)
-        }
+        named = {}
+        for key in ("inputs", *_GROUPS):
+            mine, others = getattr(self, key), getattr(other, key)
+            named[key] = {name: np.concatenate([mine[name], others[name]]) for name in mine}
         resting = {
-            name: np.concatenate(
-                [
-                    mine.resting.get(name, np.zeros_like(mine.inputs[name][:, 0]))
-                    for mine in (self, other)
-                ]
-            )
+            name: np.concatenate([self._at_rest(name), other._at_rest(name)])
             for name in {**self.resting, **other.resting}
         }
         words = {
@@ -269,6 +261,10 @@ class Trials(Brief):
         }
         changed: dict[str, Any] = {**words, **arrays, **named, "resting": resting}
         return replace(self, **changed)
+
+    def _at_rest(self, name: str) -> FloatArray:
+        """Returns inputs (R, C) before time zero, which are zero for trials from rest."""
+        return self.resting.get(name, np.zeros_like(self.inputs[name][:, 0]))
 
     def chosen(self, names: Sequence[str] | None) -> tuple[str, ...]:
         """Returns some names of trials; all if None.
@@ -376,7 +372,8 @@ class Trials(Brief):
             return Inputs(**acting), Inputs(**last)
         moved = self.contact_at(names, body, time_step)
         acting |= {name: torch.from_numpy(values[1:].copy()) for name, values in moved.items()}
-        if (poses := self.base_at(names, time_step)) is not None:
+        poses = self.base_at(names, time_step)
+        if poses is not None:
             fixed = torch.from_numpy(
                 np.asarray(body.mesh.vertices[body.fixed_vertices], dtype=np.float64)
             )

@@ -61,7 +61,8 @@ class ArmWorld(World[MountedState]):
     def __init__(self, robot: Robot, driven: str, count: int, time_step: float) -> None:
         mujoco = mujoco_package()
         self._scene = scene = gripper(robot.integrated_by("implicit_euler"), _DIVISIONS)
-        self.count, self.time_step, self.input = count, time_step, driven
+        self.count, self.input = count, driven
+        self.time_step = time_step
         self._substeps = round(time_step / robot.time_step)
         self.ball = scene.scene.vertex_slice(BALL)
         ball = scene.simulator.rest_positions[self.ball].cpu().numpy()

@@ -28,11 +28,17 @@ SPEED: Final = 0.02  # of the gripper [m/s]: it rises while it closes
 FINGERS: Final = {"left": 0.0, "right": np.pi}  # angles about z [rad]
 BALL: Final = "ball"
 _GRIPPER: Final = "gripper"  # owner of the memory variable of the height
-_RADIUS, _MASS, _YOUNGS_MODULUS = 0.01, 0.01, 1e7  # of the ball [m, kg, Pa]
+# Of the ball.
+_RADIUS: Final = 0.01  # m
+_MASS: Final = 0.01  # kg
+_YOUNGS_MODULUS: Final = 1e7  # Pa
 # Between fingers and ball at rest, and from the fingers down to the table [m].
 _GAP, _BELOW = 1.5e-3, 1.5e-3
-# Of all contact [Pa, 1, m, m/s].
-_STIFFNESS, _FRICTION, _DISTANCE, _SLIP_SPEED = 5e4, 0.8, 5e-4, 5e-3
+# Of all contact.
+_STIFFNESS: Final = 5e4  # Pa
+_FRICTION: Final = 0.8
+_DISTANCE: Final = 5e-4  # m
+_SLIP_SPEED: Final = 5e-3  # m/s
 _TOLERANCE: Final = 1e-6  # of the solver, relative
 
 
@@ -117,7 +123,8 @@ class GraspWorld(World[State]):
 
     def __init__(self, robot: Robot, driven: str, count: int, time_step: float) -> None:
         self._scene = gripper(robot)
-        self.count, self.time_step, self.input = count, time_step, driven
+        self.count, self.input = count, driven
+        self.time_step = time_step
         self._substeps = round(time_step / robot.time_step)
         with torch.no_grad():
             rest = self._scene.begin(count)

@@ -29,7 +29,7 @@ from ..robot.robot import Robot
 from .arm_world import JOINT_SPEED, ArmWorld
 from .grippers import RISE, SPEED, GraspWorld
 from .tasks import FollowTask, PlaceTask, Reach, ReachTask, RobotTask, SwingTask
-from .vector import ActionMapping, RobotVectorEnv, gym
+from .vector import ActionMapping, RobotVectorEnv, VectorOptions, gym
 
 TASKS: Final = ("reach", "follow", "swing_up", "grasp", "pick_and_place")
 WORLDS: Final = ("simulator", "reduced", "laboratory")
@@ -101,7 +101,12 @@ def make_vector(
     seconds = (5.0 if arms else 2.0) if seconds is None else seconds
     actions, up = max(round(seconds / action_time), 1), _up(robot)
     shown = None if robot.labels else _spread_vertices(robot)
-    bodies, mapping = _bodies(task, robot, num_envs, world, spread, axis, shown, seed, frames)
+    if task == "swing_up":
+        bodies, mapping = _on_bases(robot, num_envs, spread, axis, shown, frames)
+    elif task in ("grasp", "pick_and_place"):
+        bodies, mapping = _grippers(task, robot, num_envs, world, frames)
+    else:
+        bodies, mapping = _driven(robot, num_envs, world, spread, shown, seed, frames)
     rest = bodies.markers(bodies.rest)[0]
     # Coordinates of the task among those of the markers.
     last = {"grasp": 3, "pick_and_place": 6}.get(task)
@@ -123,8 +128,8 @@ def make_vector(
             if follows
             else ReachTask(num_envs, actions, reach)
         )
-    options = (noise, autoreset_mode, render_mode, up, forces, squeeze)
-    return RobotVectorEnv(bodies, goals, mapping, point, actions, *options)
+    options = VectorOptions(noise, autoreset_mode, render_mode, up, forces, squeeze)
+    return RobotVectorEnv(bodies, goals, mapping, point, actions, options)
 
 
 def _lift(robot: Robot, count: int, up: FloatArray, place: FloatArray, grasps: bool) -> SwingTask:
@@ -173,33 +178,37 @@ def _loaded(
     return robot, frames
 
 
-def _bodies(
-    task: str,
+def _on_bases(
+    robot: Robot,
+    count: int,
+    spread: float,
+    axis: Sequence[float],
+    shown: list[int] | None,
+    frames: int,
+) -> tuple[World[Any], ActionMapping]:
+    """Robots driven by their base along an axis, and the map from actions to its place."""
+    along = np.concatenate(
+        [np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis), np.zeros(3)]
+    )[None]
+    bodies = RobotWorld(robot, BASE, count, spread, along, shown)
+    most = np.full(1, _BASE)
+    return bodies, ActionMapping(-most, most, np.full(1, _BASE_SPEED), np.zeros(1), frames)
+
+
+def _driven(
     robot: Robot,
     count: int,
     world: str,
     spread: float,
-    axis: Sequence[float],
     shown: list[int] | None,
     seed: int,
     frames: int,
 ) -> tuple[World[Any], ActionMapping]:
-    """Robots driven as in the trials of their run, by their base along an axis, or as grippers.
-
-    And the map to inputs.
+    """Robots driven as in the trials of their run, and the map from actions to their input.
 
     Worlds begin without inputs.
     """
     bodies: World[Any]
-    if task in ("grasp", "pick_and_place"):
-        return _grippers(task, robot, count, world, frames)
-    if task == "swing_up":
-        along = np.concatenate(
-            [np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis), np.zeros(3)]
-        )[None]
-        bodies = RobotWorld(robot, BASE, count, spread, along, shown)
-        most = np.full(1, _BASE)
-        return bodies, ActionMapping(-most, most, np.full(1, _BASE_SPEED), np.zeros(1), frames)
     driven = driven_input(robot)
     if world == "reduced":
         bodies = ReducedWorld(reduced_of(robot), count)
@@ -241,7 +250,8 @@ def _grippers(
     bodies: World[Any]
     if task == "grasp":
         bodies = GraspWorld(robot, driven.name, count, time_step)
-        low, high, rate = np.append(low, 0.0), np.append(high, RISE), np.append(rate, SPEED)
+        low, high = np.append(low, 0.0), np.append(high, RISE)
+        rate = np.append(rate, SPEED)
     else:
         bodies = arms = ArmWorld(robot, driven.name, count, time_step)
         low, high = np.append(low, arms.low), np.append(high, arms.high)

@@ -61,11 +61,8 @@ class ScriptedPolicy:
             raise InputError("the scripted policy needs a task with goals: choose reach or follow.")
         reach = task.reach if reach is None else reach
         self._rests = Polynomial.fitted(reach.actions, reach.places / task.size, _ORDER)
-        self._rest, self._tracked, self._size = (
-            environment.rests[0].ravel(),
-            environment.tracked,
-            task.size,
-        )
+        self._rest = environment.rests[0].ravel()
+        self._tracked, self._size = environment.tracked, task.size
         self._parts, self._ahead = task.reach.actions.shape[1], ahead
 
     def __call__(self, seen: Observation) -> NDArray[np.float32]:
@@ -106,7 +103,8 @@ class ScriptedGrasp:
 
     def __call__(self, seen: Observation) -> NDArray[np.float32]:
         """Returns actions (B, 2) for observations (B, width)."""
-        displacements, command, height = (seen.shape[1] - 3) // 2, seen[:, -3], seen[:, -2]
+        displacements = (seen.shape[1] - 3) // 2
+        command, height = seen[:, -3], seen[:, -2]
         still = np.abs(seen[:, displacements:-3]).max(axis=1) < _STILL
         lifts = (height > -1.0) | (still & (command > self._action - 1e-3))
         return np.stack([np.full(len(seen), self._action), np.where(lifts, 1.0, -1.0)], 1).astype(
@@ -144,7 +142,8 @@ class ScriptedPlace:
         to_ball, to_goal = self._size * seen[-7:-1].reshape(2, 3)
         still = float(np.abs(seen[len(seen) // 2 - 7 : -14]).max()) < _UNMOVED
         is_open, is_closed = fingers < _END - 1.0, fingers > 1.0 - _END
-        closes, move, up = not is_open, np.zeros(3), np.array([0.0, 0.0, 1.1 * LIFT])
+        closes = not is_open
+        move, up = np.zeros(3), np.array([0.0, 0.0, 1.1 * LIFT])
 
         def down(way: FloatArray) -> tuple[FloatArray, bool]:
             """Returns the move along a way (3,), first above its end,

@@ -87,7 +87,8 @@ class GoalTask(RobotTask):
 
     def __init__(self, count: int, actions: int, reach: Reach) -> None:
         self.goals = np.tile(reach.middle, (count, actions + 1, 1))
-        self.size, self.width, self.reach = reach.size, 3 * len(PREVIEW), reach
+        self.reach, self.size = reach, reach.size
+        self.width = 3 * len(PREVIEW)
 
     @override
     def observed(self, points: FloatArray, number: IntArray) -> FloatArray:
@@ -168,7 +169,8 @@ class SwingTask(RobotTask):
             raise InputError(
                 "swing_up needs a tracked point away from the base: choose others in tracked."
             )
-        self._up, self._rest, self._count = up / np.linalg.norm(up), rest, count
+        self._up = up / np.linalg.norm(up)
+        self._rest, self._count = rest, count
         self.size, self.width = length, 1
 
     @override
@@ -212,7 +214,8 @@ class PlaceTask(RobotTask):
     size, width = _FROM_BALL, 7
 
     def __init__(self, count: int, rest: FloatArray) -> None:
-        self._rest, self._lifted, self.goals = rest, np.zeros(count), np.tile(rest, (count, 1))
+        self._rest, self._lifted = rest, np.zeros(count)
+        self.goals = np.tile(rest, (count, 1))
 
     @override
     def begin(self, row: int, random: np.random.Generator) -> None:

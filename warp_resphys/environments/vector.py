@@ -50,6 +50,27 @@ class ActionMapping:
     frames: int  # number of simulation steps of an action
 
 
+@dataclass(frozen=True)
+class VectorOptions:
+    """How robots of an environment are observed, reset and drawn.
+
+    Attributes:
+        noise: standard deviation of observed coordinates [m], if the world has none.
+        autoreset_mode: when episodes are reset, as in Gymnasium.
+        render_mode: ``rgb_array`` for pictures, or None.
+        up: (3,) upward direction of the pictures.
+        forces: whether the forces at the bases are observed (`World.forces`).
+        squeeze: penalty on the force of fingers beyond what they need (`World.squeeze`).
+    """
+
+    noise: float = 0.0
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP
+    render_mode: str | None = None
+    up: ArrayLike = (0.0, 0.0, 1.0)
+    forces: bool = False
+    squeeze: float = 0.0
+
+
 class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     """B robots with one task, whose episodes end and begin independently.
 
@@ -64,12 +85,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         mapping: from actions to the input of the world.
         tracked: (3, 3 M) from the markers to the point of the task, or (6, 3 M) to its two points.
         actions: number A of actions of an episode.
-        noise: standard deviation of observed coordinates [m], if the world has none.
-        autoreset_mode: when episodes are reset, as in Gymnasium.
-        render_mode: ``rgb_array`` for pictures, or None.
-        up: (3,) upward direction of the pictures.
-        forces: whether the forces at the bases are observed (`World.forces`).
-        squeeze: penalty on the force of fingers beyond what they need (`World.squeeze`).
+        options: what is observed, reset and drawn.
 
     Attributes:
         actions: A.
@@ -91,37 +107,32 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         mapping: ActionMapping,
         tracked: FloatArray,
         actions: int,
-        noise: float = 0.0,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        render_mode: str | None = None,
-        up: ArrayLike = (0.0, 0.0, 1.0),
-        forces: bool = False,
-        squeeze: float = 0.0,
+        options: VectorOptions = VectorOptions(),
     ) -> None:
-        if render_mode not in (None, *RENDER_MODES):
+        if options.render_mode not in (None, *RENDER_MODES):
             raise InputError(
-                f"render_mode is {render_mode!r}: choose rgb_array, for pictures as arrays."
+                f"render_mode is {options.render_mode!r}: choose rgb_array, for pictures as arrays."
             )
-        self.world, self.task, self._mapping, self.tracked = world, task, mapping, tracked
+        self.world, self.task = world, task
+        self._mapping, self.tracked = mapping, tracked
         self.actions, self.frames = actions, mapping.frames
-        self._noise = noise if world.noise is None else world.noise
-        self.num_envs, self.render_mode = world.count, render_mode
-        mode = AutoresetMode(autoreset_mode)
+        self._noise = options.noise if world.noise is None else world.noise
+        self.num_envs, self.render_mode = world.count, options.render_mode
+        self._mode = AutoresetMode(options.autoreset_mode)
         rate = round(1.0 / (world.time_step * mapping.frames))
         self.metadata = {
             "render_modes": [*RENDER_MODES],
             "render_fps": rate,
-            "autoreset_mode": mode,
+            "autoreset_mode": self._mode,
         }
-        self._up = np.asarray(up, dtype=np.float64)
+        self._up = np.asarray(options.up, dtype=np.float64)
         self._camera: Camera | None = None
-        self._mode = mode
         self.state = world.rest
         self.rests = world.markers(self.state)
-        self._forces, self._squeeze = forces, squeeze
+        self._forces, self._squeeze = options.forces, options.squeeze
         width = 2 * self.rests[0].size + world.parts + task.width
-        width += world.forces(self.state).shape[1] if forces else 0
-        if squeeze:
+        width += world.forces(self.state).shape[1] if options.forces else 0
+        if options.squeeze:
             world.squeeze(self.state)
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (width,), np.float32)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (world.parts,), np.float32)

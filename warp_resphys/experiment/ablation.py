@@ -18,7 +18,7 @@ from ..core.stepping.state import State
 from ..data.markers import MarkerMap
 from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
-from ..io.parts import Arrays, Parts, Report, TrialPart
+from ..io.parts import Arrays, Report, TrialPart
 from ..io.progress import show
 from ..io.resuming import Stage, StageContext, package_versions, resources_used, run_stages
 from ..io.safe_files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json
@@ -142,7 +142,7 @@ def ablate(context: StageContext, workers: Workers = ALONE) -> None:
     """
     counts = list(context.settings.ablation.counts)
     motion, uncorrected = read_motion(context.run_dir)
-    parts = Parts.of(context, workers)
+    parts = context.parts(workers)
     sets = {
         count: TrialPart(
             f"markers_{count}", (str(count),), len(motion), partial(_from_markers, context, count)

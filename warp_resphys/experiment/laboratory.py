@@ -32,7 +32,7 @@ from ..data.trials import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from ..io.arrays import FloatArray
 from ..io.errors import InputError, number_of
 from ..io.fan_out import ALONE, Workers
-from ..io.parts import Arrays, Parts, Report, TrialPart, cut
+from ..io.parts import Arrays, Report, TrialPart, cut
 from ..io.resuming import StageContext
 from ..io.safe_files import write_json
 from ..learning.sensing import readings
@@ -108,7 +108,7 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
                     f"{begins}_{first:03d}", some, frames, partial(_played, settings, some, frames)
                 )
             )
-    parts = Parts.of(context, workers)
+    parts = context.parts(workers)
     parts.run(cut_up)
     setup = make_setup(settings)
     seen = {

@@ -10,7 +10,6 @@ from ..core.energies.catalogue import read_law
 from ..data.rigid_bodies import corners_of
 from ..data.trials import Trials, evenly
 from ..io.fan_out import ALONE, Workers
-from ..io.parts import Parts
 from ..io.resuming import StageContext, package_versions
 from ..io.safe_files import atomic_hdf5, create, resume_checkpoint, write_checkpoint, write_json
 from ..learning.comparison import Comparison
@@ -169,7 +168,7 @@ def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
     experiment = Experiment(settings, context.run_dir)
     model = settings.model
     folder = context.run_dir
-    parts = Parts.of(context, workers, settings.batch)
+    parts = context.parts(workers, settings.batch)
     found = reconstruction.reconstruct(
         experiment.model_simulator(model),
         experiment.motions,
@@ -247,7 +246,7 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     """
     settings: StageSettings = context.settings
     experiment = Experiment(settings, context.run_dir, "count")
-    parts = Parts.of(context, workers, settings.batch)
+    parts = context.parts(workers, settings.batch)
     with_points = (
         experiment.has_forces and experiment.trials.bound is None and not settings.with_law
     )

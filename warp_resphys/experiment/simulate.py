@@ -36,7 +36,7 @@ from ..data.markers import WHOLE_STATE, MarkerMap, Observation
 from ..data.trials import GIVEN, Trials
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
-from ..io.parts import Arrays, Parts, Report, TrialPart
+from ..io.parts import Arrays, Report, TrialPart
 from ..io.resuming import StageContext
 from ..settings.body import SimulatorSettings, SteppedSettings, TargetSettings
 from ..settings.data_kinds import MovingBase, ReadingSettings, ReleaseFromTwist, SimulatedData
@@ -150,7 +150,7 @@ def simulate(context: StageContext) -> None:
         check_steps(poses, points, "data.base_motion")
     for name, moved in obstacles.items():
         check_steps(moved[0], points, f"data.obstacle_motion.{name}", f"the obstacle {name!r}")
-    parts = Parts.of(context)
+    parts = context.parts()
     part = TrialPart("part_000", names, frames, partial(_free_motion, settings, names))
     parts.run([part])
     observed = parts.read(part, "observed")

@@ -72,6 +72,11 @@ class _Scope:
     sides: dict[str, list[tuple[Member, int]]] = field(default_factory=dict)  # elements of surfaces
     motion: tuple[FloatArray, FloatArray] = (np.eye(3), np.zeros(3))  # rotation and translation
 
+    @property
+    def is_solid(self) -> bool:
+        """Whether there are elements of three dimensions."""
+        return any(dimension == 3 for _, dimension, _ in self.blocks)
+
     def instance(self, data: list[str]) -> "_Scope":
         """Returns an instance of this part, moved by the data lines of *INSTANCE:
         translated, then rotated.
@@ -173,11 +178,12 @@ def read_abaqus(path: str) -> tuple[FloatArray, list[Block]]:
             if keyword == "PART":
                 scope = deck.parts[deck.name(options["NAME"])] = _Scope()
             elif keyword == "INSTANCE":
-                if (part := options.get("PART", "").upper()) not in deck.parts:
+                part = deck.parts.get(options.get("PART", "").upper())
+                if part is None:
                     raise DecodingError(
                         f"the file has no *PART of the name '{options.get('PART', '')}'"
                     )
-                scope = deck.instances[deck.name(options["NAME"])] = deck.parts[part].instance(data)
+                scope = deck.instances[deck.name(options["NAME"])] = part.instance(data)
             elif keyword in ("ENDPART", "ENDINSTANCE"):
                 scope = deck.model
             elif keyword == "NODE":
@@ -217,7 +223,7 @@ def _cards(text: str) -> Iterator[tuple[int, str, dict[str, str], list[str]]]:
                 raise DecodingError(
                     f"line {number} comes before the first keyword; is it a file of Abaqus?"
                 )
-            _, head, data = heads[-1]
+            head, data = heads[-1][1:]
             goes_on = not data and head[-1].endswith(",") and not line[0].isdigit()
             (head if goes_on else data).append(line)
     for number, head, data in heads:
@@ -250,7 +256,8 @@ def _elements(scope: _Scope, kind: str, data: list[str]) -> IntArray:
     Returns their numbers, none for beams, springs and others that are ignored.
     """
     solid, face = _SOLID.match(kind), _FACE.match(kind)
-    count = int(found[1]) if (found := solid or face) else 0
+    found = solid or face
+    count = int(found[1]) if found else 0
     if count not in (_SOLIDS if solid else _FACES):
         if _OTHER_SOLID.match(kind):
             raise DecodingError(
@@ -286,11 +293,7 @@ def _member(word: str) -> Member:
 def _groups(deck: _Deck) -> dict[tuple[str, str], list[IntArray]]:
     """Returns numbers of elements by the name of a set or instance, and by scope."""
     scopes, groups = deck.scopes(), dict[tuple[str, str], list[IntArray]]()
-    parts = [
-        at
-        for at, scope in scopes.items()
-        if any(dimension == 3 for _, dimension, _ in scope.blocks)
-    ]
+    parts = [at for at, scope in scopes.items() if scope.is_solid]
     for at, scope in scopes.items():
         if at in parts and len(parts) > 1:
             groups[deck.spelling.get(at, "model"), at] = [rows[:, 0] for _, _, rows in scope.blocks]
@@ -303,7 +306,8 @@ def _groups(deck: _Deck) -> dict[tuple[str, str], list[IntArray]]:
 def _arranged(deck: _Deck) -> tuple[FloatArray, list[Block]]:
     """Returns points and blocks of all instances."""
     groups, solids = _groups(deck), dict[str, list[tuple[str, IntArray, IntArray]]]()
-    points, blocks, first = [np.empty((0, 3))], list[Block](), 0
+    points, blocks = [np.empty((0, 3))], list[Block]()
+    first = 0
     for at, scope in deck.scopes().items():
         numbers = np.array([*scope.nodes], dtype=np.int64)
         for kind, dimension, rows in scope.blocks:
@@ -320,8 +324,11 @@ def _arranged(deck: _Deck) -> tuple[FloatArray, list[Block]]:
             blocks.append(Block(kind, dimension, nodes, cells))
             if dimension == 3:
                 solids.setdefault(at, []).append((kind, rows[:, 0], nodes))
-        defined = Counter(number for _, _, rows in scope.blocks for number in rows[:, 0].tolist())
-        if (times := max(defined.values(), default=0)) > 1:
+        defined = Counter[int]()
+        for _, _, rows in scope.blocks:
+            defined.update(rows[:, 0].tolist())
+        times = max(defined.values(), default=0)
+        if times > 1:
             raise DecodingError(
                 f"*ELEMENT: element {max(defined, key=defined.__getitem__)} is defined {times} "
                 "times"

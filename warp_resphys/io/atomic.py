@@ -81,7 +81,8 @@ def digest(path: str | Path) -> str:
     """SHA-256 of a file's content, or of the names and contents of the files
     in a folder, in hexadecimal.
     """
-    if (folder := Path(path)).is_dir():
+    folder = Path(path)
+    if folder.is_dir():
         files = sorted(file for file in folder.rglob("*") if file.is_file())
         contents = "".join(f"{file.relative_to(folder)} {digest(file)}\n" for file in files)
         return hashlib.sha256(contents.encode()).hexdigest()

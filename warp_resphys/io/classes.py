@@ -54,7 +54,8 @@ class ClassSettings(Settings):
                 these arguments.
         """
         kind = imported(self.target, base, f"{where}: ")
-        if missing := sorted(getattr(kind, "__abstractmethods__", ())):
+        missing = sorted(getattr(kind, "__abstractmethods__", ()))
+        if missing:
             raise InputError(
                 f"{where}: {self.target} has no method {' and no '.join(missing)}: add it."
             )

@@ -184,7 +184,8 @@ def mesh_arrays(path: str, file_format: str | None = None) -> Arrays:
     suffix = {None: Path(path).suffix.lower(), "gmsh": ".msh", "abaqus": ".inp"}.get(file_format)
     with Path(path).open("rb") as file:
         of_fluent = suffix == ".msh" and file.read(1) == b"("  # which meshio writes by default
-    if of_fluent or (reader := MESH_READERS.get(suffix or "")) is None:
+    reader = MESH_READERS.get(suffix or "")
+    if of_fluent or reader is None:
         return mesh_arrays_of(*_read_by_meshio(path, file_format))
     try:
         return mesh_arrays_of(*reader(path))

@@ -124,7 +124,8 @@ class ConvergenceError(ResphysError, RuntimeError):
 
 def warn(message: str) -> None:
     """Issues a `ResphysWarning` at the line of the user's program that led to it."""
-    package, depth, frame = __name__.partition(".")[0], 2, sys._getframe(1)
+    package = __name__.partition(".")[0]
+    depth, frame = 2, sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(
         f"{package}."
     ):

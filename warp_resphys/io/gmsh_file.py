@@ -108,7 +108,8 @@ def read_gmsh(path: str) -> tuple[FloatArray, list[Block]]:
     order = ">" if mark == b"\0\0\0\1" else "<"
     names = {}
     for line in (decoded(sections.get("PhysicalNames", b"")) or "").splitlines():
-        if match := re.match(r'\s*(\d)\s+(-?\d+)\s+"(.*)"', line):
+        match = re.match(r'\s*(\d)\s+(-?\d+)\s+"(.*)"', line)
+        if match:
             names[int(match[1]), abs(int(match[2]))] = match[3]
     if 2.0 <= number < 3.0:
         return _version_2(sections, names, is_text, order)
@@ -146,7 +147,8 @@ def _version_4(
         if key in sections:
             groups |= _entities(sections[key], key == "PartitionedEntities", version)
     numbers, points = _nodes(sections["Nodes"], version)
-    elements, blocks, is_new = sections["Elements"], [], version > 4.0
+    elements, blocks = sections["Elements"], []
+    is_new = version > 4.0
     for _ in range(elements.integers(4 if is_new else 2, "q")[0]):
         first, second, kind = elements.integers(3)
         dimension, entity = (first, second) if is_new else (second, first)
@@ -224,10 +226,11 @@ def _version_2(
     at, left = 0, int(head)
     while left > 0:
         if is_text:
-            kind, count, tagged, at = values[at + 1], 1, values[at + 2], at + 3
+            kind, tagged = values[at + 1 : at + 3]
+            count = 1
         else:
             kind, count, tagged = values[at : at + 3]
-            at += 3
+        at += 3
         nodes = _kind(kind)[2]
         for _ in range(count):
             start = at + tagged + (0 if is_text else 1)

@@ -92,7 +92,8 @@ def _git(folder: Path, *arguments: str) -> str | None:
 def peak_memory_gib() -> float:
     """Peak resident memory of this process [GiB]; 0 on Windows, which is not asked."""
     # Unlike getrusage, without the memory of the parent process.
-    if peaks := _kibibytes("/proc/self/status", "VmHWM"):
+    peaks = _kibibytes("/proc/self/status", "VmHWM")
+    if peaks:
         return peaks[0] / 2**20
     if resource is None:
         return 0.0
@@ -108,7 +109,8 @@ def available_memory_gib() -> float:
     """
     limits = [kibibytes / 2**20 for kibibytes in _kibibytes("/proc/meminfo", "MemAvailable")]
     limit = Path("/sys/fs/cgroup/memory.max")
-    if limit.is_file() and (text := limit.read_text().strip()).isdigit():
+    text = limit.read_text().strip() if limit.is_file() else ""
+    if text.isdigit():
         limits.append(int(text) / 2**30)
     return min(limits, default=float("inf"))
 

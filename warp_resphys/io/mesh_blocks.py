@@ -64,7 +64,8 @@ def rows_of(numbers: IntArray, nodes: IntArray) -> IntArray:
     order = np.argsort(numbers, kind="stable")
     at = np.minimum(np.searchsorted(numbers, nodes, sorter=order), len(numbers) - 1)
     rows = order[at] if len(numbers) else np.zeros_like(nodes)
-    if (missing := nodes[numbers[rows] != nodes] if len(numbers) else nodes).size:
+    missing = nodes[numbers[rows] != nodes] if len(numbers) else nodes
+    if missing.size:
         raise DecodingError(
             f"node {missing.flat[0]} of a cell is not in the file; save the mesh again"
         )

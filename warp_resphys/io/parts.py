@@ -20,7 +20,6 @@ from threadpoolctl import threadpool_limits
 from .errors import DataFileError, InputError
 from .fan_out import ALONE, Workers, fan_out
 from .progress import Progress
-from .resuming import StageContext
 from .safe_files import (
     atomic_hdf5,
     create,
@@ -96,27 +95,10 @@ class Parts:
         fingerprint: str = "",
         batch: int | None = None,
     ) -> None:
-        self.name, self.workers, self.folder, self.fingerprint, self.batch = (
-            name,
-            workers,
-            folder,
-            fingerprint,
-            batch,
-        )
+        self.name, self.workers = name, workers
+        self.folder, self.fingerprint = folder, fingerprint
+        self.batch = batch
         self._kept: dict[TrialPart, Arrays] = {}
-
-    @classmethod
-    def of(
-        cls, context: StageContext, workers: Workers = ALONE, batch: int | None = None
-    ) -> "Parts":
-        """Returns the parts of a stage, with their files in the folder of the run."""
-        return cls(
-            context.name,
-            workers,
-            context.run_dir / f"{context.name}_parts",
-            context.fingerprint,
-            batch,
-        )
 
     def run(self, parts: Sequence[TrialPart]) -> None:
         """Computes the parts that are not done.
@@ -126,10 +108,9 @@ class Parts:
             DataFileError: a file could not be written.
         """
         left, workers = [part for part in parts if not self._is_done(part)], self.workers
-        total, missing = (
-            sum(part.frames * len(part.names) for part in subset) for subset in (parts, left)
-        )
-        with Progress(self.name, total, "frames", total - missing) as progress:
+        frames = [part.frames * len(part.names) for part in left]
+        total = sum(part.frames * len(part.names) for part in parts)
+        with Progress(self.name, total, "frames", total - sum(frames)) as progress:
             if workers.alone or (workers.address is None and len(parts) == 1):
                 with threadpool_limits(1):  # As in worker processes, for the same results.
                     for part in left:
@@ -137,7 +118,6 @@ class Parts:
                 return
             if self.folder is not None:
                 self.folder.mkdir(parents=True, exist_ok=True)
-            frames = [part.frames * len(part.names) for part in left]
             shared, crew = self.folder or Path.cwd(), workers.at_most(len(left))
             # Without arrays.
             keeps = Parts(self.name, folder=self.folder, fingerprint=self.fingerprint)

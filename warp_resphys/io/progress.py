@@ -119,9 +119,10 @@ class Progress:
         after: float = 0.0,
     ) -> None:
         self._after, self._ended = after, False
-        self.description, self.total, self.unit, self.done = description, total, unit, start_at
-        self._title = title_of(description)
-        self._start_at, self._shown, self._calls = start_at, -1, 0
+        self.description, self._title = description, title_of(description)
+        self.total, self.unit = total, unit
+        self.done = self._start_at = start_at
+        self._shown, self._calls = -1, 0
         self.console = Console(stderr=True, quiet=not _SHOWN.get()) if console is None else console
         self._fields: dict[str, object] = {}
         self._start = self._next = 0.0
@@ -263,10 +264,10 @@ def aligned(rows: Sequence[Sequence[str]], left: int = 1) -> str:
     the others to the right.
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if at < left else cell.rjust(width)
-            for at, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    )
+
+    def line(row: Sequence[str]) -> str:
+        names = map(str.ljust, row[:left], widths[:left])
+        numbers = map(str.rjust, row[left:], widths[left:])
+        return "  ".join([*names, *numbers]).rstrip()
+
+    return "\n".join(map(line, rows))

@@ -27,7 +27,9 @@ from filelock import FileLock, Timeout
 from .atomic import digest
 from .classes import check_packages
 from .errors import DataFileError, InputError
+from .fan_out import ALONE, Workers
 from .machine import peak_memory_gib
+from .parts import Parts
 from .progress import one_line
 from .safe_files import FORMAT_VERSION, read_json, to_plain, write_json
 from .settings import Settings, packages_of
@@ -58,6 +60,11 @@ class StageContext:
     settings: Any  # of the stage
     upstream: Mapping[str, str] = field(default_factory=dict)  # of stages whose outputs it reads
 
+    def parts(self, workers: Workers = ALONE, batch: int | None = None) -> Parts:
+        """Returns the parts of the stage's work, with their files in the run folder."""
+        folder = self.run_dir / f"{self.name}_parts"
+        return Parts(self.name, workers, folder, self.fingerprint, batch)
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -84,7 +91,8 @@ def fingerprint(stage: Stage, upstream_fingerprints: Mapping[str, str]) -> str:
         ),
         "upstream": [upstream_fingerprints[name] for name in stage.upstream],
     }
-    if packages := packages_of(stage.settings):
+    packages = packages_of(stage.settings)
+    if packages:
         content["packages"] = packages
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()

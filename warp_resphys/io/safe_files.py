@@ -180,9 +180,8 @@ def read_hdf5(path: str | Path, expected_kind: str) -> Iterator[h5py.File]:
         except (DecodingError, OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
             raise hdf5_error(path, error) from error
         try:
-            origin, version, kind, complete = (
-                str(file.attrs.get(name)) for name in ("format", "version", "kind", "complete")
-            )
+            names = ("format", "version", "kind", "complete")
+            origin, version, kind, complete = (str(file.attrs.get(name)) for name in names)
             if origin != FORMAT:
                 raise DataFileError(f"{path} was not written by {FORMAT}: check the path")
             if version != str(FORMAT_VERSION):

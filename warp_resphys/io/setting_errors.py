@@ -78,7 +78,8 @@ def sentence(schema: Schema, values: Any, where: str, errors: Sequence[ErrorDeta
 
     whole = _Place(schema, schema, values)
     error, place = max(((error, _place(whole, error)) for error in errors), key=rank)
-    kind, value, key = error["type"], place.value, _dotted(place.path, where)
+    kind, value = error["type"], place.value
+    key = _dotted(place.path, where)
     if kind == "extra_forbidden":
         return _unknown(place, where)
     if error["loc"][-1:] == ("[key]",):
@@ -151,7 +152,8 @@ def _dotted(path: Path, where: str = "") -> str:
 
 def _unknown(place: _Place, where: str) -> str:
     """Message for an unknown key: the most similar keys, else all keys of its group."""
-    group, name, key = place.group, str(place.path[-1]), _dotted(place.path, where)
+    group, name = place.group, str(place.path[-1])
+    key = _dotted(place.path, where)
     assert group is not None
     kinds = [option["properties"] for option in group.kinds if "properties" in option]
     for other in kinds[1:]:
@@ -258,7 +260,8 @@ def _type(node: Schema, schema: Schema) -> str:
     """Describes the values of one type, without their unit."""
     if "wanted" in node:
         return str(node["wanted"])
-    if words := _words_of(node):
+    words = _words_of(node)
+    if words:
         return str(words[0]) if len(words) == 1 else f"one of {', '.join(map(str, words))}"
     kind = node.get("type", "")
     if kind == "array":

@@ -14,6 +14,7 @@ import io
 import re
 from collections import defaultdict
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -114,7 +115,8 @@ def read_rows(path: str | Path) -> Rows:
     text = _SEPARATOR.sub("", read_text(path))
     lines = text.split("\n")
     last = [line for line in lines if line.strip()][-_LAST:]
-    common = (mark for mark in "\t;," if 2 * sum(mark in line for line in last) > len(last))
+    present = {mark: sum(mark in line for line in last) for mark in "\t;,"}
+    common = (mark for mark, count in present.items() if 2 * count > len(last))
     delimiter = next(common, None)
     if delimiter is None:
         return _with_points([re.findall(r"[^ \t\f\v]+", line.lstrip("#")) for line in lines], path)
@@ -124,13 +126,15 @@ def read_rows(path: str | Path) -> Rows:
         raise DataFileError(
             f"{path} is no table ({error}): export it as CSV or TSV again."
         ) from error
-    rows = [[cell.strip() for cell in row] for row in rows]
+    rows = [list(map(str.strip, row)) for row in rows]
     if _GROUPED.search(text):
-        rows = [
-            [_GROUPED.sub("", cell) if _BLANK_GROUPS.fullmatch(cell) else cell for cell in row]
-            for row in rows
-        ]
+        rows = [list(map(_without_blanks, row)) for row in rows]
     return _with_points(rows, path)
+
+
+def _without_blanks(cell: str) -> str:
+    """Returns a cell without blanks and apostrophes between groups of three digits."""
+    return _GROUPED.sub("", cell) if _BLANK_GROUPS.fullmatch(cell) else cell
 
 
 def _with_points(rows: Rows, path: str | Path) -> Rows:
@@ -150,7 +154,8 @@ def _with_points(rows: Rows, path: str | Path) -> Rows:
         for column, cell in enumerate(row)
         if not everywhere and _HUNDREDS.fullmatch(cell)
     }
-    if "," not in everywhere and not bare and not any("," in cell for row in rows for cell in row):
+    commas = any("," in cell for cell in chain.from_iterable(rows))
+    if "," not in everywhere and not bare and not commas:
         return rows
     result = list[list[str]]()
     for line, row in enumerate(rows, start=1):

@@ -73,7 +73,8 @@ def read_vtk(path: str) -> tuple[NDArray[np.float64], list[Block]]:
         converter.AddInputData(grid)
         converter.Update()
         grid = converter.GetOutput()
-    if not (count := grid.GetNumberOfCells()):
+    count = grid.GetNumberOfCells()
+    if not count:
         return np.empty((0, 3)), []
     kinds = np.fromiter(map(grid.GetCellType, range(count)), dtype=np.int64, count=count)
     cells = grid.GetCells()

@@ -66,9 +66,8 @@ class Outline:
                 "the mask shows nothing of the body: check the picture, or the colours of its mask."
             )
         size = (mask.shape[1], mask.shape[0])
-        points, near = (
-            np.concatenate([_evenly(line, by) for line in lines]) for by in (_APART, _NEAR)
-        )
+        points = np.concatenate([_evenly(line, _APART) for line in lines])
+        near = np.concatenate([_evenly(line, _NEAR) for line in lines])
         points, near = points[within(points, size)], near[within(near, size)]
         if not len(points):
             raise InputError("the mask fills the picture: no outline of the body is in it.")
@@ -90,8 +89,7 @@ class Outline:
         """Returns distances (P,) of points (P, 2), negative inside,
         and their gradients (P, 2) [px].
         """
-        _, distance, gradient = _closest(points, self.near, self.outward)
-        return distance, gradient
+        return _closest(points, self.near, self.outward)[1:]
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ class PictureMisfit(BoundedMisfit):
     ) -> None:
         super().__init__(bounds)
         self.poses, self._known = [*poses], {} if known is None else dict(known)
-        for photo in (photo for pose in self.poses for photo in pose.photos):
+        for photo in self._photos():
             if not photo.kinds:
                 raise InputError(
                     f"{photo.name} has neither an outline, "
@@ -104,9 +104,7 @@ class PictureMisfit(BoundedMisfit):
         """
         self._last, first = None, not self.prior_weight
         super().update_prior_weight(unit)
-        points = sum(
-            len(photo.cloud.measured) for pose in self.poses for photo in pose.photos if photo.cloud
-        )
+        points = sum(len(photo.cloud.measured) for photo in self._photos() if photo.cloud)
         if first and points:
             self.prior_weight = min(self.prior_weight, 1.0 / points)
 
@@ -120,6 +118,9 @@ class PictureMisfit(BoundedMisfit):
         if self._last is None or not np.array_equal(self._last[0], unit):
             self._last = unit.copy(), super().objective(unit, True)
         return self._last[1]
+
+    def _photos(self) -> list[Photo]:
+        return [photo for pose in self.poses for photo in pose.photos]
 
     @staticmethod
     def _acts(name: str, pose: SeenPose) -> bool:
@@ -235,7 +236,8 @@ class PictureMisfit(BoundedMisfit):
         points = list[LinearTrial]()
         vertices, velocities = pose.seen(photo, shapes, values)
         q, moved = vertices[0], torch.cat([vertices[1:], velocities[None]])
-        share, copies, camera = share / photo.kinds, pose.copies(photo), photo.camera
+        share, camera = share / photo.kinds, photo.camera
+        copies = pose.copies(photo)
         if photo.outline is not None:
             rim, of_simulated, of_measured = pose.outlines(photo, q, corrections)
             slopes = self._pixel_slopes(
@@ -316,11 +318,8 @@ class PictureMisfit(BoundedMisfit):
             columns: K numbers of the physical parameters.
         """
         slopes = np.zeros((len(self.bounds), *by.shape[1:]))
-        slopes[columns], late, placed = (
-            by[: len(columns)],
-            -by[len(columns)],
-            by[len(columns) + 1 :],
-        )
+        slopes[columns] = by[: len(columns)]
+        late, placed = -by[len(columns)], by[len(columns) + 1 :]
         for column, (name, range_) in enumerate(self.bounds.items()):
             parameter, owner = split_name(name)
             if owner in (*pose.owners, photo.lens) and parameter in (*CORRECTIONS, RELEASE_DELAY):

@@ -110,11 +110,9 @@ class ReleasedForce:
         names = identifiable_parameters(simulator)
         # A factor without effect, so that there are as many sets where only the force differs.
         parameters = {MASS_FACTOR: simulator.tensor([1.0] * len(values))}
-        parameters |= {
-            name: simulator.tensor([row[name] for row in values])
-            for name in values[0]
-            if name in names
-        }
+        for name in values[0]:
+            if name in names:
+                parameters[name] = simulator.tensor([row[name] for row in values])
         added = [[row.get(name, 0.0) for name in RELEASE_FORCES] for row in values]
         pull = simulator.tensor(np.zeros((len(values), len(near), 3)))
         force = simulator.tensor(self.force) + simulator.tensor(added)

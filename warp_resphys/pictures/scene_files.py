@@ -311,7 +311,8 @@ def read_tracked(
             rows = _table(path, names, least)
     except (OSError, KeyError, IndexError, ValueError) as error:
         raise DataFileError(f"cannot read tracked points from {path} ({error}).") from error
-    if missing := [frame for frame in frames if frame not in rows]:
+    missing = [frame for frame in frames if frame not in rows]
+    if missing:
         raise DataFileError(f"{path} has no row of frame {missing[0]}.")
     return np.stack([rows[frame] for frame in frames])
 
@@ -338,7 +339,8 @@ def _table(path: Path, names: Sequence[str], least: float) -> dict[int, FloatArr
         first = len(of_head)
     if heads[0] != "frame":
         raise ValueError(f"its first column is '{heads[0]}', not 'frame'")
-    if missing := [name for name in names if f"{name}.x" not in heads or f"{name}.y" not in heads]:
+    missing = [name for name in names if not {f"{name}.x", f"{name}.y"} <= {*heads}]
+    if missing:
         there = dict.fromkeys(head.rpartition(".")[0] for head in heads[1:])
         raise ValueError(
             f"it has no columns x and y of {listed(missing)}, but of {listed([*there])}"
@@ -409,7 +411,8 @@ def read_scan(path: str | Path, unit: float, seed: int = 0) -> tuple[FloatArray,
 
 def _pcd(path: Path) -> FloatArray:
     """Points of a file of the Point Cloud Library, as text or binary."""
-    content, start, head = path.read_bytes(), 0, dict[str, list[str]]()
+    content, start = path.read_bytes(), 0
+    head = dict[str, list[str]]()
     while "DATA" not in head:
         end = content.index(b"\n", start)
         key, *values = content[start:end].decode("ascii").split() or ["#"]

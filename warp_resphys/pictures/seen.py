@@ -292,10 +292,8 @@ class SeenPose:
             if near is None
             else (near[0], near[1].to(sim.rest_state(1).q))
         )
-        first, last = (
-            [known.get(name, 0.0) for name in (CLAMP_TURN, CLAMP_SHIFT)]
-            for known in (before, values)
-        )
+        first = [before.get(name, 0.0) for name in (CLAMP_TURN, CLAMP_SHIFT)]
+        last = [values.get(name, 0.0) for name in (CLAMP_TURN, CLAMP_SHIFT)]
         parts, inputs = max(math.ceil(abs(last[0] - first[0]) / _TURNED), 1), None
         with torch.no_grad():
             for turn, shift in np.linspace(first, last, parts + 1)[1:]:
@@ -337,7 +335,7 @@ class SeenPose:
         from the first to it, and shifted.
         """
         sim = self.simulator
-        _, axis, _ = self._between()
+        axis = self._between()[1]
         rest = sim.rest_state(1).q[0]
         mine = torch.isin(sim.fixed, torch.as_tensor(self.clamps[1]).to(sim.fixed))[:, None]
         return torch.where(

@@ -286,7 +286,8 @@ class Commands:
         inputs: Mapping[str, RobotInput],
         parameters: Mapping[str, torch.Tensor],
     ) -> None:
-        self._simulator, self._description, self._inputs = simulator, description, inputs
+        self._simulator, self._inputs = simulator, inputs
+        self._description = description
         self._mass_factor = parameters.get(MASS_FACTOR)
         h = simulator.time_step
         filters = description.filters if description.learned is not None else ()

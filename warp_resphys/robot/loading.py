@@ -115,10 +115,8 @@ def trial_names(robot: Robot) -> tuple[str, ...]:
     Raises:
         InputError: the robot was loaded from a file.
     """
-    return (
-        *(first := held_out_names(robot)),
-        *(name for name in _experiment(robot).trials.names if name not in first),
-    )
+    first = held_out_names(robot)
+    return (*first, *(name for name in _experiment(robot).trials.names if name not in first))
 
 
 def held_out_names(robot: Robot, moving: bool = False) -> tuple[str, ...]:

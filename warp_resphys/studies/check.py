@@ -304,7 +304,8 @@ def actuated(**options: Any) -> Simulator:
     """A beam with a chamber that is wound with fibres, and two tendons."""
     box = box_hexahedra(SIZE, (6, 3, 3))
     outer = np.abs(box.vertices[box.cells].mean(1) / SIZE - 0.5).max(1) > 0.3
-    chambers = find_chambers(mesh := Mesh(box.vertices, box.cells[outer]))
+    mesh = Mesh(box.vertices, box.cells[outer])
+    chambers = find_chambers(mesh)
     tendons = Tendons([np.linspace([0.0, y, 0.03], [0.1, y, 0.03], 7) for y in (0.01, 0.02)], 50.0)
     return beam(
         mesh,

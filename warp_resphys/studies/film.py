@@ -84,7 +84,8 @@ def _film_of_trial(run: Path, settings: FilmSettings) -> tuple[str, RenderScene]
     if settings.controllers is not None:
         raise InputError("controllers drive motions: name one by motion=, such as motion=eight_4s.")
     finished_record(run, "evaluate")
-    metrics, models, seconds = read_json(run / METRICS), settings.models, settings.seconds
+    metrics = read_json(run / METRICS)
+    models, seconds = settings.models, settings.seconds
     if models is None:
         available = tuple(model for model in metrics["errors_mm"] if model not in BASELINES)
         models = (

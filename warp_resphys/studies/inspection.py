@@ -103,7 +103,8 @@ def inspect(settings: Inspection, folder: Path) -> None:
         picture = folder / "mesh.png" if settings.picture else None
         file = None if settings.save is None else folder / settings.save
         print(inspect_mesh(settings.mesh, settings.fixed, settings.density, picture, file))
-        if written := [str(path) for path in (file, picture) if path is not None]:
+        written = [str(path) for path in (file, picture) if path is not None]
+        if written:
             print(f"Written: {', '.join(written)}")
 
 
@@ -125,9 +126,9 @@ def inspect_mesh(
     rows: list[tuple[str, str]] = []
     surfaces: Mapping[str, IntArray] = {}
     if isinstance(settings, FileMesh):
-        path, units, order = settings.path, settings.units, settings.order
+        path, units = settings.path, settings.units
         points = read_vertices(path, units)
-        mesh = read_mesh(path, units, order, drop_unreferenced=True)
+        mesh = read_mesh(path, units, settings.order, drop_unreferenced=True)
         unused = len(points) - len(read_mesh(path, units, drop_unreferenced=True).vertices)
         rows.append(
             ("vertices in the file", f"{len(points):,} = {3 * len(points):,} degrees of freedom")
@@ -135,7 +136,7 @@ def inspect_mesh(
         if unused:
             how = "left out of .msh and .inp, and elsewhere by drop_unreferenced"
             rows.append(("of these unused", f"{unused} belong to no cell: {how}"))
-        surfaces = read_surfaces(path, units, order, True)
+        surfaces = read_surfaces(path, units, settings.order, True)
     else:
         mesh = build_mesh(settings)
         points = mesh.vertices
@@ -158,7 +159,8 @@ def inspect_mesh(
     rows.append(("open cavities", _cavities(mesh)))
     if not mesh.element.parents:
         rows.append(("quadratic cells", _quadratic_cells(mesh, place)))
-        if thin := [name for name, cells in mesh.regions.items() if is_one_cell_thick(mesh, cells)]:
+        thin = [name for name, cells in mesh.regions.items() if is_one_cell_thick(mesh, cells)]
+        if thin:
             rows.append(
                 (
                     "one cell thick",

@@ -209,7 +209,8 @@ class LiveRobot:
 
     def reset(self) -> None:
         """Restarts from the initial state of the trial, or from rest without inputs."""
-        self.time, self.failure, self.held, self.moved = 0.0, "", None, {}
+        self.time, self.failure = 0.0, ""
+        self.held, self.moved = None, {}
         for values in self.inputs.values():
             values[:] = 0.0
         with torch.no_grad():
@@ -236,11 +237,8 @@ class LiveRobot:
             acting["external_force"] = weights[:, None] * (
                 self._stiffness * (target - weights @ self.positions)
             )
-        wanted = {
-            name: np.asarray(acting.pop(name))
-            for name in [q.name for q in MOTION]
-            if name in acting
-        }
+        moving = [quantity.name for quantity in MOTION if quantity.name in acting]
+        wanted = {name: np.asarray(acting.pop(name)) for name in moving}
         placed = self._obstacles(wanted)
         try:
             with torch.no_grad():

@@ -93,7 +93,8 @@ class LiveTwin:
     trial = None
 
     def __init__(self, robot: Robot, source: str, settings: TwinSettings) -> None:
-        self.robot, self._source, self._settings = robot, source, settings
+        self.robot, self._settings = robot, settings
+        self._source = source
         self._listener = Listener(source) if "://" in source else None
         self.seconds: deque[float] = deque(maxlen=_REMEMBERED)
         self.twin = settings.twin(robot)
@@ -116,8 +117,9 @@ class LiveTwin:
         self._estimate: Estimate | None = None
         self._prediction: Forecast | None = None
         self._seen: Mapping[str, Any] = {}
-        self._predicted_at, self._drained, self._spent = -np.inf, time.perf_counter(), 0.0
-        self.time, self.failure, self.state = self._clock, "", object()
+        self._predicted_at, self._drained = -np.inf, time.perf_counter()
+        self._spent, self.failure = 0.0, ""
+        self.time, self.state = self._clock, object()
 
     def _packets_of_recording(self) -> Iterator[Packet] | None:
         if self._listener is not None:
@@ -262,9 +264,9 @@ class LiveTwin:
             packets, now = list(self._listener.packets()), time.perf_counter()
             if len(packets) > 1 and now - self._drained > _BEHIND:
                 self.twin.restart("after it had fallen behind")
-                latest = {
-                    name: value for packet in packets for name, value in packet.inputs.items()
-                }
+                latest = dict[str, Any]()
+                for packet in packets:
+                    latest |= packet.inputs
                 plans = [packet.plan for packet in packets if packet.plan is not None]
                 packets = [replace(packets[-1], inputs=latest, plan=plans[-1] if plans else None)]
             self._drained = now

@@ -65,7 +65,8 @@ def train_policy(settings: Policies, folder: Path) -> None:
         from ..environments.making import make_vector
         from ..environments.tasks import GoalTask
     wp.config.log_level = wp.LOG_WARNING
-    run, task, models = Path(settings.run).expanduser(), settings.skill, settings.models
+    run = Path(settings.run).expanduser()
+    task, models = settings.skill, settings.models
     reaches, learned_on = {}, settings.learned_on
     for model in models:
         goal = make_vector(task, run, 1, model, learned_on).task
@@ -89,10 +90,10 @@ def train_policy(settings: Policies, folder: Path) -> None:
     groups: dict[str, list[_Policy]] = {}
     for policy in policies.values():
         groups.setdefault(policy.group, []).append(policy)
-    rows = [
-        [group, *(_text([policy.errors[world] for policy in alike]) for world in worlds)]
-        for group, alike in groups.items()
-    ]
+    rows = list[list[str]]()
+    for group, alike in groups.items():
+        of_group = [[policy.errors[world] for policy in alike] for world in worlds]
+        rows.append([group, *map(_text, of_group)])
     title = f"Mean error in mm, task {task}, {settings.episodes} episodes"
     if len(settings.seeds) > 1:
         title += f", policies of {len(settings.seeds)} seeds (lowest to highest)"
@@ -143,7 +144,8 @@ def _policies(
             autoreset_mode="SameStep",
             reach=reaches[models[-1]],
         )
-        if (reach := reaches[model]) is None:
+        reach = reaches[model]
+        if reach is None:
             for share in _SHARES:
                 name = f"scripted, {share:.0%} of the range"
                 policies[name] = _Policy(name, ScriptedGrasp(share), origin)
@@ -193,9 +195,8 @@ def _test(
         for name, world in every
         if kept.get(name, {}).get(world, {}).get("asked") != asked[name]
     ]
-    total, to_do = (
-        sum(environments[world].actions for _, world in pairs) for pairs in (every, left)
-    )
+    total = sum(environments[world].actions for _, world in every)
+    to_do = sum(environments[world].actions for _, world in left)
     with Progress("trials", total, "actions", total - to_do) as progress:
         for name, world in left:
             errors = errors_mm(environments[world], policies[name].act, _SEED, progress.advance)

@@ -150,7 +150,8 @@ def _checked(run: RunSettings, search: Tune) -> tuple[dict[str, Any], TrainingSe
             "tune.space is empty: it must name at least one setting, such as network.width."
         )
     groups = ("network", "trainer" if training.in_the_loop is None else "in_the_loop")
-    if unused := [key for key in (*fixed, *space) if key.partition(".")[0] not in groups]:
+    unused = [key for key in (*fixed, *space) if key.partition(".")[0] not in groups]
+    if unused:
         raise InputError(
             f"the trials do not depend on tune's {unused[0]}: search {' and '.join(groups)} only."
         )

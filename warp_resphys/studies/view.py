@@ -154,7 +154,8 @@ class Page:
         self._server, self._live = server, live
         self._requests: list[Callable[[], None]] = []
         self._lock = threading.Lock()
-        self._playing, self._speed, self._stopped = True, 1.0, False
+        self._playing, self._stopped = True, False
+        self._speed = 1.0
         self._holder: int | None = None  # Client that drags the body.
         # State, trial and robot that are shown.
         self._shown_now: tuple[object, ...] = (None, None, None)
@@ -248,7 +249,8 @@ class Page:
             self._requests.append(request)
 
     def _set_controls(self) -> None:
-        gui, robot, live = self._server.gui, self._live.robot, self._live
+        gui, live = self._server.gui, self._live
+        robot = live.robot
         gui.configure_theme(dark_mode=False, show_logo=False)
         text = _HELP_TWIN if isinstance(live, LiveTwin) else _HELP
         gui.add_markdown(
@@ -376,8 +378,10 @@ class Page:
 
         Returns pictures a second.
         """
-        live, began, last, updated = self._live, time.perf_counter(), time.perf_counter(), 0.0
-        due, simulated, counted = 0.0, 0.0, 0
+        live = self._live
+        began = last = time.perf_counter()
+        updated = due = simulated = 0.0
+        counted = 0
         try:
             while not self._stopped and (seconds is None or time.perf_counter() - began < seconds):
                 now = time.perf_counter()
@@ -405,7 +409,8 @@ class Page:
                     self._show_status(
                         counted / since if updated else 0.0, simulated / since if updated else 0.0
                     )
-                    updated, simulated, counted = now, 0.0, 0
+                    updated = now
+                    simulated, counted = 0.0, 0
                 time.sleep(max(1.0 / _RATE - (time.perf_counter() - now), 1e-3))
         except KeyboardInterrupt:
             pass

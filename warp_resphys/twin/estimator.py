@@ -31,11 +31,13 @@ from .belief import Belief, Correction
 # one frame corrects; and of a simulator whose errors are not known, so that a marker further off
 # has jumped or the body is elsewhere.
 _UNKNOWN, _SIMULATOR = 0.1, 0.02
-# Times [s]: after which the force on the body, such as a touch, is another; over which it is judged
-# whether markers stay away or the simulator without markers is better, which is longer than a
-# period of most soft bodies; and after which a refined parameter, such as a stiffness that depends
-# on the temperature, is another.
-_WANDER, _JUDGED, _FORGET = 1.0, 0.2, 10.0
+_WANDER = 1.0  # after which the force on the body, such as a touch, is another [s]
+# Over which it is judged whether markers stay away or the simulator without markers is better,
+# which is longer than a period of most soft bodies [s].
+_JUDGED = 0.2
+# After which a refined parameter, such as a stiffness that depends on the temperature, is another
+# [s].
+_FORGET = 10.0
 _WORSE: Final = (
     1.5  # errors over those of the simulator without markers, above which this takes over
 )
@@ -96,12 +98,8 @@ class TwinEstimator(ABC, Generic[B]):
                 f"noise is {noise:g}: give the deviation "
                 "of a marker's coordinate in m, more than zero."
             )
-        self.robot, self.labels, self.time_step, self.inputs = (
-            robot,
-            robot.labels,
-            robot.time_step,
-            dict(inputs),
-        )
+        self.robot, self.inputs = robot, dict(inputs)
+        self.labels, self.time_step = robot.labels, robot.time_step
         self.noise, self._names = noise, tuple(prior)
         self._prior = np.array([*prior.values()], dtype=np.float64)
         rest = robot.simulator.rest_positions
@@ -235,7 +233,7 @@ class TwinEstimator(ABC, Generic[B]):
 
     def markers(self, belief: B) -> tuple[FloatArray, FloatArray]:
         """Returns markers (M, 3), and the standard deviations of their coordinates [m]."""
-        now, slopes, _ = self._seen(belief, 0.0)
+        now, slopes = self._seen(belief, 0.0)[:2]
         spread = np.einsum("min,nk,mik->mi", slopes, belief.covariance, slopes, optimize=True)
         return now, np.sqrt(np.maximum(spread, 0.0))
 
@@ -266,7 +264,8 @@ class TwinEstimator(ABC, Generic[B]):
             explained = np.linalg.norm(residual - slopes @ change, axis=1) < _EXPLAINED * off
             restarted = restarted or bool(explained[refused].mean() > 0.5)
             if restarted:
-                belief, refused, since = lost, moved, np.zeros_like(since)
+                belief, refused = lost, moved
+                since = np.zeros_like(since)
             elif self.labels:
                 moved, refused = stays, refused & ~stays
                 more = np.zeros(len(belief.covariance))

@@ -270,9 +270,8 @@ class FullEstimator(TwinEstimator[FullBelief]):
         known = {**self.robot.simulator.parameters, PAYLOAD.name: PAYLOAD}
         quantities = [known.get(name, Quantity(name, "")) for name in self._refined]
         far = _OPEN * np.maximum(np.abs(self._known), self._prior)
-        low, high = (
-            np.array([getattr(one, end) for one in quantities]) for end in ("lower", "upper")
-        )
+        low = np.array([quantity.lower for quantity in quantities])
+        high = np.array([quantity.upper for quantity in quantities])
         return np.clip(parameters, low + far, high - far - self._apart)
 
 

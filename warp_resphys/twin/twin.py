@@ -91,7 +91,8 @@ class Twin:
                 raise InputError(f"{name} is {value:g}: give seconds, more than zero.")
         robot = robot.integrated_by("bdf2") if robot.simulator.integrator == "midpoint" else robot
         estimator = _ENGINES[engine](robot, inputs, refine or {}, noise)
-        self.estimator, self.horizon, self.patience = estimator, horizon, patience
+        self.estimator = estimator
+        self.horizon, self.patience = horizon, patience
         self.labels, self._h = estimator.labels, estimator.time_step
         self._keep = int(np.ceil(patience / self._h)) + 1
         names = self.labels or [f"vertex_{number}" for number in range(estimator.count)]
@@ -137,14 +138,9 @@ class Twin:
             self._check_unit(frame, belief)
         for interval in self._steps.values():
             self._forget(interval)
-        self._latest = time
-        self._origin, self._newest, self._again, self._stale, self._framed = (
-            time,
-            0,
-            False,
-            0,
-            False,
-        )
+        self._latest = self._origin = time
+        self._newest = self._stale = 0
+        self._again = self._framed = False
         self._commands = CommandSeries(commands, self._h)
         self._steps = {0: _Interval(predicted=belief)}
         self._simulated, self._done = 0, -1
@@ -348,7 +344,8 @@ class Twin:
         for correction in interval.corrections:
             for fault in correction.faults(self.labels):
                 self._counts.add(fault)
-            if np.isfinite(free := mean_mm(correction.free, self.labels)):
+            free = mean_mm(correction.free, self.labels)
+            if np.isfinite(free):
                 self._free.append(free)
 
     @property
@@ -437,9 +434,9 @@ class Twin:
 
     def _last_seen(self) -> FloatArray | None:
         """Markers (M, 3) as they were last seen [m], NaN where not for `patience`."""
-        frames = [
-            frame for number in sorted(self._steps) for _, frame in self._steps[number].frames
-        ]
+        frames = []
+        for number in sorted(self._steps):
+            frames += [frame for _, frame in self._steps[number].frames]
         if not frames:
             return None
         seen = frames[0].copy()

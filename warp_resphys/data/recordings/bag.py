@@ -199,7 +199,8 @@ class _Source:
             raise InputError(
                 f"data.bag names '{text}': write a topic, as /tip, /tf#tip or '/pressure#1 [mbar]'."
             )
-        self.path, self.text, self.topic, self._read = path, text, match["topic"], read
+        self.path, self._read = path, read
+        self.text, self.topic = text, match["topic"]
         self.member, self.unit = match["member"], match["unit"] or "1"
         # s; stamps are NaN without a header
         self.stamps, self.received = list[float](), list[float]()
@@ -261,7 +262,10 @@ class _Source:
         if repeated:
             log.warning(
                 "%s: %d of %d messages of %s left out, which repeat the time of another.",
-                *(self.path.name, repeated, len(stamps), self.topic),
+                self.path.name,
+                repeated,
+                len(stamps),
+                self.topic,
             )
         late, tenth = received - stamps, max(len(stamps) // 10, 1)
         return np.array([np.median(late[:tenth]), np.median(late[-tenth:])])

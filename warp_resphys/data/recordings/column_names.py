@@ -91,9 +91,8 @@ def coordinates_of(columns: Columns) -> dict[int, tuple[str, str]]:
     beside = defaultdict[tuple[int, str], set[str]](set)
     for column, (name, unit) in columns.items():
         for form, pattern in enumerate(_FORMS):
-            if (match := pattern.fullmatch(name)) and (
-                pattern is DOTTED or unit in (None, "px", *METRES_PER_UNIT)
-            ):
+            match = pattern.fullmatch(name)
+            if match and (pattern is DOTTED or unit in (None, "px", *METRES_PER_UNIT)):
                 found[column].append((form, match["label"], match["axis"].lower()))
                 beside[form, match["label"]].add(match["axis"].lower())
     result = dict[int, tuple[str, str]]()

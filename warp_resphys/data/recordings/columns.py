@@ -6,6 +6,7 @@ A cell that is empty or NaN is an occlusion.
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain, product
 from pathlib import Path
 
 import numpy as np
@@ -85,7 +86,7 @@ class Layout:
     def read(self, rows: Rows, path: Path) -> Recording:
         """Reads the recording from all lines of a file."""
         markers, chosen, turned = self._markers(path)
-        others = [column for columns in turned.values() for column in columns]
+        others = list(chain.from_iterable(turned.values()))
         others += [] if self.clock is None else [self.clock]
         known = sorted({*chosen, *others, *self.channels, *self.loads} - {-1})
         read, lines = self._numbers(rows, known, path)
@@ -137,7 +138,11 @@ class Layout:
         timed = self.seconds is not None
         rate = measured_rate if timed else self.rate
         return Recording(
-            *(tuple(markers), positions, np.nan if rate is None else rate, path, actuation),
+            tuple(markers),
+            positions,
+            np.nan if rate is None else rate,
+            path,
+            actuation,
             start=float(stamps[0]) if timed else 0.0,
             unit=self.unit or "",
             turns=turns if turned else None,
@@ -198,8 +203,8 @@ class Layout:
         axes = {axis for _, axis in columns if axis in AXES}
         optional = {*AXES} - axes if self.planar and len(axes) == 2 else set()
         bodies = dict.fromkeys(label for label, axis in columns if axis in self.turn[0])
-        wanted = [(label, axis) for label in labels for axis in AXES if axis not in optional]
-        wanted += [(label, axis) for label in bodies for axis in (*AXES, *self.turn[0])]
+        wanted = [*product(labels, [axis for axis in AXES if axis not in optional])]
+        wanted += product(bodies, (*AXES, *self.turn[0]))
         for label, axis in wanted:
             if (label, axis) not in columns:
                 what, cure = "marker", "export it again with all"
@@ -215,12 +220,11 @@ class Layout:
                 raise DataFileError(
                     f"{path}: {what} {label} has no column '{label}.{axis}'; {cure}."
                 )
-        chosen = [columns.get((label, axis), -1) for label in labels for axis in AXES]
-        return (
-            labels,
-            chosen,
-            {labels.index(body): [columns[body, axis] for axis in self.turn[0]] for body in bodies},
-        )
+        chosen = [columns.get(place, -1) for place in product(labels, AXES)]
+        turned = {}
+        for body in bodies:
+            turned[labels.index(body)] = [columns[body, axis] for axis in self.turn[0]]
+        return labels, chosen, turned
 
     def _numbers(
         self, rows: Rows, columns: Sequence[int], path: Path
@@ -277,7 +281,8 @@ def _switched_on(driven: FloatArray, lines: Sequence[int], path: Path) -> FloatA
     end = len(driven) - int(known[::-1].argmax(axis=0).max())
     frames = np.arange(end)[:, None]
     filled = np.where(frames < first, driven[first, np.arange(driven.shape[1])], driven[:end])
-    if (missing := np.isnan(filled).any(axis=1)).any():
+    missing = np.isnan(filled).any(axis=1)
+    if missing.any():
         raise DataFileError(
             f"{path}, line {lines[int(missing.argmax())]}: an actuation is missing; every frame "
             "between the first and the last one that has it needs one."
@@ -286,7 +291,9 @@ def _switched_on(driven: FloatArray, lines: Sequence[int], path: Path) -> FloatA
         log.warning(
             "%s has no actuation in its first %d frames, which get its first known value, nor in "
             "its last %d, which are left out.",
-            *(path.name, int(first.max()), len(driven) - end),
+            path.name,
+            int(first.max()),
+            len(driven) - end,
         )
     if end < _LEAST_FRAMES:
         raise DataFileError(

@@ -117,7 +117,8 @@ def quality(
         DataFileError: A marker that should not move is not in the recording.
     """
     recording.select(still)
-    noise, jumps, markers = noise_level(recording), find_jumps(recording, least_jump), []
+    noise, markers = noise_level(recording), []
+    jumps = find_jumps(recording, least_jump)
     for column, (label, seen) in enumerate(zip(recording.labels, recording.seen.T, strict=True)):
         if release is not None and label not in still:
             jumps[label] = [
@@ -143,7 +144,8 @@ def quality(
         f"From frame {frame} on, {label} stands where {other} was: check the labels."
         for label, other, frame in find_swaps(recording, jumps)
     ]
-    warnings += [warning for marker in markers for warning in marker.warnings]
+    for marker in markers:
+        warnings += marker.warnings
     released = None if release is None else release.frame
     of_file = (recording.source, recording.rate, len(recording.positions), released)
     return Quality(*of_file, longest_gap, tuple(markers), tuple(warnings))
@@ -154,17 +156,17 @@ QUALITY_COLUMNS = ("Seen", "Gaps", "Longest", "Masked", "Jumps", "Noise [mm]", "
 
 def quality_table(markers: Sequence[MarkerQuality]) -> dict[str, list[str]]:
     """Returns the cells of `QUALITY_COLUMNS` by marker."""
-    return {
-        marker.label: [
+    cells = {}
+    for marker in markers:
+        largest = max((jump.mm for jump in marker.jumps), default=0.0)
+        cells[marker.label] = [
             f"{100.0 * marker.seen:.1f} %",
             *map(str, (marker.gaps, marker.longest_gap_frames, marker.masked_frames)),
-            f"{len(marker.jumps)}"
-            + (f" ({max(j.mm for j in marker.jumps):.2f} mm)" if marker.jumps else ""),
+            f"{len(marker.jumps)}" + (f" ({largest:.2f} mm)" if marker.jumps else ""),
             "" if marker.noise_mm is None else f"{marker.noise_mm:.4f}",
             "" if marker.drift_mm is None else f"{marker.drift_mm:.3f}",
         ]
-        for marker in markers
-    }
+    return cells
 
 
 def noise_level(recording: Recording) -> FloatArray:
@@ -292,9 +294,8 @@ def compare_base(
     places, shifts, distortions = list[FloatArray](), list[FloatArray](), list[FloatArray]()
     for recording in recordings:
         base = recording.select(labels)
-        if absent := [
-            label for label, seen in zip(labels, base.seen.T, strict=True) if not seen.any()
-        ]:
+        absent = [label for label, seen in zip(labels, base.seen.T, strict=True) if not seen.any()]
+        if absent:
             raise DataFileError(
                 f"{recording.source}: {listed(absent)} is never seen; "
                 "leave it out of the base markers."

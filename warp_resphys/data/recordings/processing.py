@@ -66,6 +66,11 @@ def fill_gaps(recording: Recording, longest: int) -> Recording:
     return dataclasses.replace(recording, positions=positions)
 
 
+def _interpolated(series: FloatArray, old: IntArray, new: FloatArray) -> FloatArray:
+    """Interpolates a series (T, C) linearly at new places among its frames, (T', C)."""
+    return np.stack([np.interp(new, old, channel) for channel in series.T], axis=1)
+
+
 def resample(recording: Recording, rate: float) -> Recording:
     """Resamples a recording at the simulator's rate 1/h [Hz].
 
@@ -88,16 +93,12 @@ def resample(recording: Recording, rate: float) -> Recording:
         kept = known[below] & known[above]
         if kept.any() and np.count_nonzero(known) > 1:
             positions[kept, column] = bridged(recording, column, new[kept])
-    actuation = None
-    if recording.actuation is not None:
-        actuation = np.stack(
-            [np.interp(new, old, channel) for channel in recording.actuation.T], axis=1
-        )
+    driven = recording.actuation
+    actuation = None if driven is None else _interpolated(driven, old, new)
     base = None if recording.base is None else at_times(recording.base, old, new)
     moved = {name: at_times(poses, old, new) for name, poses in recording.obstacles.items()}
-    loads = {
-        name: np.stack([np.interp(new, old, axis) for axis in readings.T], axis=1)  # NaN beside NaN
-        for name, readings in recording.loads.items()
+    loads = {  # NaN beside NaN
+        name: _interpolated(readings, old, new) for name, readings in recording.loads.items()
     }
     resampled = dataclasses.replace(
         recording, positions=positions, actuation=actuation, base=base, rate=float(rate)

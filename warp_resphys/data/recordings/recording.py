@@ -5,6 +5,7 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +20,8 @@ log = logging.getLogger(__name__)
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _LONG = {"": "m", "centi": "cm", "milli": "mm"}
-_SPELLED = {
-    f"{prefix}{word}": unit
-    for prefix, unit in _LONG.items()
-    for word in ("meter", "meters", "metre", "metres")
-}
+_METRES = ("meter", "meters", "metre", "metres")
+_SPELLED = {prefix + word: unit for (prefix, unit), word in product(_LONG.items(), _METRES)}
 # As Vicon and OptiTrack name trajectories.
 _UNLABELLED = re.compile(r"(?:.*:)?\*|unlabell?ed|uname|[\d ]*$", re.IGNORECASE)
 # Kind and factor to SI units of forces and moments; other spellings of products, as N*m, become
@@ -116,9 +114,8 @@ class Recording(Brief):
         actuation, base = (
             None if series is None else series[chosen] for series in (self.actuation, self.base)
         )
-        obstacles, loads = (
-            {n: x[chosen] for n, x in named.items()} for named in (self.obstacles, self.loads)
-        )
+        obstacles = {name: poses[chosen] for name, poses in self.obstacles.items()}
+        loads = {name: readings[chosen] for name, readings in self.loads.items()}
         kept = dataclasses.replace(
             self, positions=self.positions[chosen], actuation=actuation, base=base
         )
@@ -159,7 +156,9 @@ def hide_zeros(recording: Recording) -> Recording:
         ]
         log.warning(
             "%s: %s at exactly (0, 0, 0) read as occluded, of %s.",
-            *(recording.source.name, number_of(int(zero.sum()), "position"), listed(names)),
+            recording.source.name,
+            number_of(int(zero.sum()), "position"),
+            listed(names),
         )
     return dataclasses.replace(
         recording, positions=np.where(zero[..., None], np.nan, recording.positions)
@@ -232,7 +231,8 @@ def in_metres(
 
 def _check_shapes(recording: Recording) -> None:
     """Refuses arrays that do not belong to each other, and inputs or times that are not finite."""
-    path, shape, driven = recording.source, recording.positions.shape, recording.actuation
+    path, driven = recording.source, recording.actuation
+    shape = recording.positions.shape
     forces_alone = shape[1:2] == (0,) and recording.loads
     if len(shape) != 3 or shape[2] != 3 or (0 in shape and not (forces_alone and shape[0])):
         raise DataFileError(
@@ -248,8 +248,9 @@ def _check_shapes(recording: Recording) -> None:
             f"{path}: actuation has the shape {driven.shape}; it needs a row for each of the "
             f"{shape[0]} frames."
         )
+    wanted = (shape[0], len(AXES))
     for name, readings in recording.loads.items():
-        if readings.shape != (wanted := (shape[0], len(AXES))):
+        if readings.shape != wanted:
             raise DataFileError(
                 f"{path}: the readings of {name!r} have the shape {readings.shape}, not {wanted}."
             )
@@ -314,7 +315,8 @@ def _with_arms(recording: Recording) -> Recording:
         arms[seen] = positions[seen, column, None] + ARM * np.swapaxes(axes, 1, 2)
         positions = np.concatenate([positions, arms], axis=1)
         new = [f"{names[column]} +{axis}" for axis in "xyz"]
-        if taken := [name for name in new if name in names]:
+        taken = [name for name in new if name in names]
+        if taken:
             raise DataFileError(
                 f"{path}: a marker is named {taken[0]!r}, as a point of a rigid body is: rename it."
             )

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
-from itertools import pairwise, takewhile
+from itertools import pairwise, product, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +82,8 @@ def _read_named(rows: Rows, path: Path) -> Recording:
         (line for form in (is_data, has_numbers) for line, row in enumerate(rows) if form(row)),
         len(rows),
     )
-    head = [[cell.lstrip("# ") for cell in row] for row in rows[:first] if any(row)] or [[""]]
+    above = [row for row in rows[:first] if any(row)] or [[""]]
+    head = [[cell.lstrip("# ") for cell in row] for row in above]
     units: list[str] = []
     if len(head) > 1 and all(unit_of(cell.strip("[]()")) in {"", *UNIT_NAMES} for cell in head[-1]):
         units = [cell.strip("[]()") for cell in head.pop()]
@@ -202,7 +203,8 @@ def _read_table(
                 f"{path} does not say in which unit its time is, which rises by more than 1 a "
                 "line: write 'time [ms]' or 'time [s]' above it."
             )
-        if (seconds := SECONDS.get((unit or "s").lower())) is None:
+        seconds = SECONDS.get((unit or "s").lower())
+        if seconds is None:
             raise DataFileError(
                 f"{path} gives its time in '{unit}': it must be in s, "
                 "ms, us, ns or iso, as in 'time [s]'."
@@ -404,12 +406,15 @@ def _read_motive(rows: Rows, path: Path) -> Recording:
         rotations = partial(Rotation.from_euler, order, degrees=True)
         turn = [f"q{axis.lower()}" for axis in order], partial(quaternions, rotations=rotations)
     known = {(name, axis) for name, axis, _ in places["Rigid Body"]}
-    whole = {name for name, _ in known if {(name, axis) for axis in ("x", *turn[0])} <= known}
-    if left := {name for name, _ in known} - whole:
+    bodies = {name for name, _ in known}
+    whole = {name for name in bodies if known.issuperset(product([name], ("x", *turn[0])))}
+    left = bodies - whole
+    if left:
         log.warning(
             "%s: rigid bodies without a position and a quaternion are not read (%s): "
             "let Motive export both.",
-            *(path.name, listed(sorted(map(str, left)))),
+            path.name,
+            listed(sorted(map(str, left))),
         )
     read = [*places["Marker"], *(place for place in places["Rigid Body"] if place[0] in whole)]
     read = read or places["Rigid Body Marker"]
@@ -432,7 +437,8 @@ def _read_vicon(rows: Rows, path: Path) -> Recording:
     wanted = {"Objects", "Trajectories"} & {*found} or {"Segments"} & {*found}
     starts = [found[name] for name in sorted(wanted)]
     sections = [_vicon_section(rows, start, path) for start in starts]
-    places, units, table, width = list[Place](), dict[int, str](), dict[str, list[str]](), 1
+    places, units = list[Place](), dict[int, str]()
+    table, width = dict[str, list[str]](), 1
     for first, section, of_columns in sections:
         data = [*takewhile(any, rows[first:])]
         for row in data:  # with the same frame of another section

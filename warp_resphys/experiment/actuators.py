@@ -102,7 +102,8 @@ def build_chambers(settings: BodySettings, mesh: Mesh) -> tuple[Chamber, ...]:
             of them.
         MeshError: no face lies at a place, or the mesh has no such surface.
     """
-    if (group := settings.chambers) is None:
+    group = settings.chambers
+    if group is None:
         return ()
     closed = find_chambers(mesh, group.axis)
     if len(closed) != group.count:
@@ -111,7 +112,8 @@ def build_chambers(settings: BodySettings, mesh: Mesh) -> tuple[Chamber, ...]:
             "open chambers do not count, so close them in the mesh, name them in "
             "chambers.faces, or change chambers.count."
         )
-    if twice := group.faces.keys() & {chamber.name for chamber in closed}:
+    twice = group.faces.keys() & {chamber.name for chamber in closed}
+    if twice:
         raise InputError(
             f"chambers.faces.{min(twice)}: a closed chamber has this name: choose another."
         )

@@ -91,7 +91,9 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
         ConvergenceError, WorkerError: a step of the simulation fails.
     """
     settings: StageSettings = context.settings
-    laboratory, trials, cut_up = settings.laboratory, settings.trials, list[TrialPart]()
+    laboratory = settings.laboratory
+    trials = settings.trials
+    cut_up = list[TrialPart]()
     for begins in dict.fromkeys(trial.begins for trial in trials):
         names = [trial.name for trial in trials if trial.begins == begins]
         if begins == STATIC:
@@ -302,7 +304,9 @@ def check_laboratory(run: RunSettings, trials: Sequence[Trial]) -> None:
     Raises:
         InputError: durations, inputs or time steps that do not fit the trials or the body.
     """
-    data, laboratory, begins = run.recorded, run.laboratory, {trial.begins for trial in trials}
+    data = run.recorded
+    laboratory = run.laboratory
+    begins = {trial.begins for trial in trials}
     assert data is not None
     assert laboratory is not None
     for trial in trials:

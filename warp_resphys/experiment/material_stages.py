@@ -137,7 +137,9 @@ def tests_of(
         InputError: samples that are no test, or none in the range.
         ConvergenceError: a simulated specimen has no equilibrium.
     """
-    fitted, held, tables = dict[str, MaterialTest](), dict[str, MaterialTest](), table_files(data)
+    fitted = dict[str, MaterialTest]()
+    held = dict[str, MaterialTest]()
+    tables = table_files(data)
     names, notes = names_of(data, tables), list[str]()
     for number, (name, wanted) in enumerate(data.tests.items()):
         found = held if wanted.held_out else fitted
@@ -207,10 +209,14 @@ def _deformed(
     size = wanted.specimen
     assert size is not None
     specimen = Specimen(size.length, size.section, poissons_ratio, size.indenter, size.cells)
-    simulated, lines, notes = specimen if size.is_simulated else None, None, list[str]()
+    simulated = specimen if size.is_simulated else None
+    lines = None
+    notes = list[str]()
     if path is not None:
         strain, stress, table = _recorded(path, data, specimen)
-        seconds, lines, notes = table.columns.get("time"), table.lines, [*table.notes]
+        seconds = table.columns.get("time")
+        lines = table.lines
+        notes = [*table.notes]
     else:
         assert data.simulated is not None
         (strain, stress), seconds = (
@@ -265,7 +271,9 @@ def identify_material(context: StageContext) -> None:
         ConvergenceError: a specimen has no equilibrium.
     """
     settings: StageSettings = context.settings
-    data, wanted, material = settings.data, settings.law, settings.simulation.values
+    data = settings.data
+    wanted = settings.law
+    material = settings.simulation.values
     ratio, density = material["poissons_ratio"], material["density"]
     tests, held, notes = tests_of(data, ratio, settings.seed)
     known = None if wanted.file is None else read_law(wanted.file)

@@ -369,9 +369,11 @@ class Comparison:
         sideways = dict(
             zip(self.names, self._in_order([*self.models][-1], "sideways").tolist(), strict=True)
         )
-        if known := {name: sideways[name] for name in test if math.isfinite(sideways[name])}:
+        known = {name: sideways[name] for name in test if math.isfinite(sideways[name])}
+        if known:
             content["sideways_mm"] = known
-        if any((fits := self._free_fits()).values()):
+        fits = self._free_fits()
+        if any(fits.values()):
             content["free_fits"] = fits
         if self.calibration and (intervals := self._intervals())["models"]:
             content["intervals"] = intervals
@@ -397,7 +399,9 @@ class Comparison:
         below it. The intervals of a robot, which does not know the variance due to the parameters,
         are `without_spread`.
         """
-        motions, trials, test = self.motions, self.motions.trials, self.groups["1"]
+        motions = self.motions
+        trials = self.motions.trials
+        test = self.groups["1"]
         rest = rest_places(trials)
         target = counted(motions, self.train, test, self._first_frames)
         names = [*dict.fromkeys(chain(self.calibration, *map(self._calibrating, self._growing)))]
@@ -433,7 +437,8 @@ class Comparison:
             alone[model] = self._calibrated(model, known) if model in self.spreads else None
         models = dict[str, ModelIntervals]()
         for model in (model for model in simulated if model in self.simulated):
-            if (intervals := self._grown(model, whole)) is None:
+            intervals = self._grown(model, whole)
+            if intervals is None:
                 continue
             new = self.simulated[model][: len(test)]
             tested = predicted_trials(trials, test, new, target, self.spreads.get(model))
@@ -441,7 +446,8 @@ class Comparison:
                 {name: intervals.covered(trial, rest) for name, trial in tested.items()}
             )
             models[model] = {**intervals.plain(), **covered}
-            if (of_robot := self._grown(model, alone)) is not None:
+            of_robot = self._grown(model, alone)
+            if of_robot is not None:
                 models[model]["without_spread"] = of_robot.plain()
         without = any(change is not None for change in changes.values())
         trained = not {*self.calibration}.isdisjoint(self.train)

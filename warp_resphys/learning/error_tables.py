@@ -134,7 +134,8 @@ class ComparedModels:
             content["per_marker"] = {
                 model: errors_per_marker(x, seen, labels) for model, x in test.items()
             }
-        if bodies := corners_of(trials.labels):
+        bodies = corners_of(trials.labels)
+        if bodies:
             content["orientations_deg"] = {
                 model: {
                     name: _mean_angle(x[:count, :, at], points[:count, :, at])
@@ -142,11 +143,14 @@ class ComparedModels:
                 }
                 for model, x in self.simulated.items()
             }
-        if horizons := self._by_horizon(test, observed):
+        horizons = self._by_horizon(test, observed)
+        if horizons:
             content["horizons"] = horizons
-        if phases := self._by_phase(test, observed):
+        phases = self._by_phase(test, observed)
+        if phases:
             content["phases"] = phases
-        if beyond := beyond_training(self.motions, self.train, names, self.first_frames):
+        beyond = beyond_training(self.motions, self.train, names, self.first_frames)
+        if beyond:
             content["beyond"] = beyond
         if self.loads:
             content["forces"] = self._by_sensor()

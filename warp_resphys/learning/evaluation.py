@@ -233,7 +233,9 @@ class TrialRollout:
         data_driven: bool = False,
         start: Start | None = None,
     ) -> None:
-        self._simulator, self._motions, self._data_driven = simulator, motions, data_driven
+        self._simulator = simulator
+        self._motions = motions
+        self._data_driven = data_driven
         self._values = {} if identified is None else identified.values(simulator)
         self.replay = motions.replay(simulator, names, identified)
         self.start = motions.start(self.replay, identified) if start is None else start
@@ -253,7 +255,9 @@ class TrialRollout:
             learned: the network.
             replay: of the trials under other inputs; None: `replay`.
         """
-        if (given := len(learned.network.rest)) != (wanted := len(self._simulator.rest_positions)):
+        given = len(learned.network.rest)
+        wanted = len(self._simulator.rest_positions)
+        if given != wanted:
             raise InputError(
                 f"a force on {given} vertices was learned, "
                 f"but the body has {wanted}: learn one for it."
@@ -305,7 +309,9 @@ class TrialRollout:
         They are NaN in an initial state that no equilibrium led to, and infinite where the
         simulation has diverged.
         """
-        before, self._before, sensors = self._before, state, len(self.replay.trials.sensors)
+        before = self._before
+        self._before = state
+        sensors = len(self.replay.trials.sensors)
         resting = number == 0 and self.start.at_rest
         none = state.q.new_full((state.batch, sensors, 6), torch.nan)
         if self._data_driven or not sensors:
@@ -346,7 +352,9 @@ class TrialRollout:
         Args:
             learned: network; None for the simulator alone.
         """
-        motions, observed, steps = self._motions, self.replay.trials.observed, self.steps
+        motions = self._motions
+        observed = self.replay.trials.observed
+        steps = self.steps
         observed = observed[:, : motions.learned_steps(observed.shape[1] - 1) + 1]
         if motions.train_fraction < 1.0:
             steps = min(steps, motions.learned_steps(steps))

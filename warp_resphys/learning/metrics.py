@@ -189,7 +189,8 @@ def errors_per_marker(
             marker_errors(x[:, m : m + 1], y[:, m : m + 1])
             for x, y in zip(simulated, observed, strict=True)
         ]
-        if of_trials := [of_trial.mean() for of_trial in errors if len(of_trial)]:
+        of_trials = [of_trial.mean() for of_trial in errors if len(of_trial)]
+        if of_trials:
             means[label] = _finite_mean(np.array(of_trials))
     return means
 

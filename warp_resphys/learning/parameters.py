@@ -184,7 +184,8 @@ def check_ranges(
             raise InputError(
                 f"parameters names {name} and its parts, {', '.join(parts)}: choose one."
             )
-        if (word := command_of(simulator, name)[1]) in _NOT_NEGATIVE and limits.lower < 0.0:
+        word = command_of(simulator, name)[1]
+        if word in _NOT_NEGATIVE and limits.lower < 0.0:
             raise InputError(
                 f"parameters.{name}.lower is {limits.lower:g}: a {word.replace('_', ' ')} is not "
                 "negative: set it to zero or more."

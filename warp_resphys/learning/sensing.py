@@ -124,7 +124,8 @@ def loads_at_steps(
     steps = step * np.arange(count)
     series = np.full((len(since), count, *loads.shape[2:]), np.nan)
     for row, sensor, axis in np.ndindex(len(since), *loads.shape[2:]):
-        known = np.isfinite(values := loads[row, :, sensor, axis])
+        values = loads[row, :, sensor, axis]
+        known = np.isfinite(values)
         if known.any():
             times, frame = since[row, known], np.diff(since[row]).max(initial=step)
             near = np.abs(steps[:, None] - times).min(1) <= _NEAR * frame

@@ -174,7 +174,8 @@ def _batches(trials: Trials, names: Sequence[str], alone: Sequence[str]) -> Iter
     """Trials that begin in the same way; some by themselves."""
     for batch in trials.batches(names):
         yield from ([name] for name in batch if name in alone)
-        if others := [name for name in batch if name not in alone]:
+        others = [name for name in batch if name not in alone]
+        if others:
             yield others
 
 

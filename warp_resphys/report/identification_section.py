@@ -94,9 +94,8 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
         else {name: body.length for name, body in markers.rigid_bodies.items()}
     )
     blocks += [Text(placement_text(name, placement, lengths)) for name, placement in placed.items()]
-    if histories := {
-        name: result.history for name, result in identified.items() if any(result.history)
-    }:
+    histories = {name: result.history for name, result in identified.items() if any(result.history)}
+    if histories:
         alt = (
             "Loss of the identification over its evaluations, with a line for each start, on a "
             "logarithmic axis."

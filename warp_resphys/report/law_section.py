@@ -159,7 +159,8 @@ def wording(name: str) -> tuple[Wording, str]:
     if name in _TERMS:
         words, meaning, (unit, factor) = _TERMS[name]
         return (words, unit, factor), meaning
-    if exponents := [*ogden_terms({name: 0.0})]:
+    exponents = [*ogden_terms({name: 0.0})]
+    if exponents:
         return (f"Ogden's term of exponent {exponents[0]}", *_KPA), _OGDEN
     numbered = re.fullmatch(r"(\w+)_(\d+)", name)
     if numbered and numbered[1] in _NUMBERED:
@@ -260,9 +261,8 @@ def _moduli_table(data: RunReport, parameters: Mapping[str, float]) -> PageTable
         row("Poisson's ratio", "poissons_ratio", 1.0),
     ]
     notes = ["Of slow motions: viscosity and relaxing branches left out."]
-    if branches := sum(
-        value for name, value in parameters.items() if name.startswith("prony_modulus")
-    ):
+    branches = sum(value for name, value in parameters.items() if name.startswith("prony_modulus"))
+    if branches:
         fast = 1e-3 * (law.mu + branches)
         notes.append(
             "With the relaxing branches, in fast motions, "
@@ -504,7 +504,9 @@ def _energy(
     c10, c20, c30, c01, c02, dilation, bulk_1, bulk_2 = (
         parameters.get(name, 0.0) for name in _ISOTROPIC
     )
-    j, first, second = s.prod() - 1.0, s.square().sum(), _pairs(s.square())
+    j = s.prod() - 1.0
+    first = s.square().sum()
+    second = _pairs(s.square())
     a, b = first - 3.0 - 2.0 * j + j**2, second - 3.0 - 4.0 * j
     energy = (
         c10 * a

@@ -352,7 +352,8 @@ def _finished(parts: Sequence[Part]) -> Iterator[Part]:
 
 def _times(metrics: Usage) -> Iterator[Part]:
     """Yields the section on computing times and memory; nothing without times."""
-    if seconds := metrics.get("seconds"):
+    seconds = metrics.get("seconds")
+    if seconds:
         stages = {**seconds, "Sum, also of stages that ran at once": sum(seconds.values())}
         rows = [Row(stage, [Cell(duration_text(spent))]) for stage, spent in stages.items()]
         one = metrics.get("seconds_per_test_trajectory", {})

@@ -62,7 +62,9 @@ def details_table(metrics: Metrics, settings: RunSettings) -> PageTable:
     With two groups of test trials, each has a column; published errors are of trials as in
     training.
     """
-    errors, groups, idle = metrics["errors_mm"], grouped_errors(metrics, settings), unused(metrics)
+    errors = metrics["errors_mm"]
+    groups = grouped_errors(metrics, settings)
+    idle = unused(metrics)
     published = published_beside(published_errors(settings.name), list(errors))
     beside = {"Published": {model: Cell.of(error) for model, error in published.items()}}
     columns: dict[str, dict[str, Cell]] = {}

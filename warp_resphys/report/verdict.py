@@ -82,7 +82,8 @@ def results_table(metrics: Metrics, settings: RunSettings) -> PageTable:
     best = best_of(known_errors(last, idle), RANKED)
     mark = "best beyond the training" if len(groups) > 1 else "best"
     rows = []
-    if named := [model_words(model) for model in dict.fromkeys(plain.values()) if model]:
+    named = [model_words(model) for model in dict.fromkeys(plain.values()) if model]
+    if named:
         cells = [columns[title].get(model, Cell("")) for title, model in plain.items()]
         rows.append(Row(f"without physics ({', '.join(named)})", cells, mark * (best in BASELINES)))
     rows += [
@@ -111,7 +112,8 @@ def error_cell(errors: Sequence[float | None], with_interval: bool = False) -> C
     or how many roll-outs diverged.
     """
     known = [error for error in errors if error is not None]
-    if lost := len(errors) - len(known):
+    lost = len(errors) - len(known)
+    if lost:
         return Cell(f"{lost} of {len(errors)} diverged")
     return Cell(number_text(fmean(known)), interval_text(errors) if with_interval else "")
 
@@ -157,7 +159,8 @@ def verdict(metrics: Metrics, settings: RunSettings) -> list[str]:
         f"{played}{beyond}{_best_text(known)}{_at_rest(every)}" if known else "all models diverged"
     ]
     inside = every[0] if len(groups) > 1 else {}
-    if (best := best_of(inside, RANKED)) and len(inside[best]) >= LEAST_EVIDENCE:
+    best = best_of(inside, RANKED)
+    if best and len(inside[best]) >= LEAST_EVIDENCE:
         texts.append(
             f"within them, {model_words(best)} is {'enough' if best in BASELINES else 'best'}"
         )

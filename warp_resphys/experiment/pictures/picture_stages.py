@@ -181,7 +181,9 @@ class _Plan:
         run_dir: Path,
         cameras: Mapping[str, Mapping[str, list[list[float]]]] | None = None,
     ) -> None:
-        self.settings, self.data, self.poses = settings, settings.data, SeenPoses(settings, run_dir)
+        self.settings = settings
+        self.data = settings.data
+        self.poses = SeenPoses(settings, run_dir)
         self._cameras = {
             name: {
                 lens: torch.tensor(camera, dtype=torch.float64) for lens, camera in by_lens.items()

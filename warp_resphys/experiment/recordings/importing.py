@@ -48,9 +48,10 @@ def import_recordings(context: StageContext) -> None:
     _check_input_unit(recorded)
     names = [trial.name for trial in recorded.trials]
     sessions = [trial.session for trial in recorded.trials]
-    if text := sessions_text(
+    text = sessions_text(
         {n: r.rate for n, r in zip(names, recorded.measured, strict=True)}, sessions
-    ):
+    )
+    if text:
         log.warning("import: %s", text)
     training = names if context.settings.learned is None else context.settings.learned
     offsets = _offsets(recorded)
@@ -365,7 +366,9 @@ def _series(
         steps: time steps of driven trials; None without such trials.
         least: least number T of frames.
     """
-    trials, cutoff, step = recorded.trials, recorded.data.cutoff, recorded.settings.time_step
+    trials = recorded.trials
+    cutoff = recorded.data.cutoff
+    step = recorded.settings.time_step
     lengths = [
         len(moving.positions) if t.is_released else 1
         for t, moving in zip(trials, recorded.moving, strict=True)
@@ -454,7 +457,9 @@ def _registration(recorded: RegisteredTrials, row: int, shifts: FloatArray) -> R
     """Content of registration.json on a trial, in millimetres
     but for positions in the frame of the body [m].
     """
-    markers, fit, tracked = recorded.markers, recorded.registrations[row], recorded.tracked
+    markers = recorded.markers
+    fit = recorded.registrations[row]
+    tracked = recorded.tracked
     # Places of the tracked markers of a loaded body are not known, and do not concern the
     # registration.
     known = [*markers.reference, *(markers.tracked if recorded.shows_places[row] else [])]

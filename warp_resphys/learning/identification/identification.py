@@ -257,7 +257,8 @@ def _separated(found: Identification, ranges: Mapping[str, Bounds]) -> Identific
         name: p.mean for name, p in priors.items()
     }
     found = replace(found, parameters=parameters, of_trials=of_trials)
-    if (uncertainty := found.uncertainty) is None:
+    uncertainty = found.uncertainty
+    if uncertainty is None:
         return found
     rows = [names.index(name) for name in common]
     correlation = np.eye(len(common) + len(priors))
@@ -301,9 +302,8 @@ def _shown_first(
     shown = list[tuple[list[str], dict[str, Bounds]]]()
     for (session, trial), names in groups.items():
         owners = ("trial",) if trial else ("session", "trial")
-        if not (
-            wanted := {name: limits for name, limits in ranges.items() if limits.owner in owners}
-        ):
+        wanted = {name: limits for name, limits in ranges.items() if limits.owner in owners}
+        if not wanted:
             continue
         times, observed = (x[trials.rows(names)] for x in (trials.times, trials.observed))
         frames = np.isfinite(observed).all(-1).any(-1) & (times <= seconds + 1e-9)

@@ -202,7 +202,8 @@ def identify_from_tests(
     search = _Search(
         tests, density, poissons_ratio, tuple(f"prony_{float(time)!r}" for time in times), known
     )
-    if unknown := [term for term in terms if not TERMS.fullmatch(term) or term == "c10"]:
+    unknown = [term for term in terms if not TERMS.fullmatch(term) or term == "c10"]
+    if unknown:
         raise InputError(
             f"terms has {unknown[0]!r}: choose from c20, c30, "
             "c01, c02, and ogden_3, ogden_m3 and so on."
@@ -448,7 +449,8 @@ class _System:
             slopes.append(np.stack(columns, 1)[chosen] * weights[:, None] * self.scales)
         residuals.append(x[len(self.names) :])
         slopes.append(np.eye(len(x))[len(self.names) :])
-        if (known := self.search.known) is not None:
+        known = self.search.known
+        if known is not None:
             shares = np.array(
                 [shear_modulus({name: 1.0}) for name in self.names] + [0.0] * len(self.of_machines)
             )

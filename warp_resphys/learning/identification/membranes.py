@@ -91,7 +91,8 @@ class Membrane(Brief):
     def __post_init__(self) -> None:
         """Checks the sizes."""
         for name in ("radius", "thickness", "cap", "force", "ring_modulus", "cell"):
-            if not (math.isfinite(size := getattr(self, name)) and size > 0.0):
+            size = getattr(self, name)
+            if not (math.isfinite(size) and size > 0.0):
                 raise InputError(
                     f"{name} of a membrane is {size:g}: give a positive number, in SI units."
                 )
@@ -325,7 +326,9 @@ class _Problem:
         """Returns the equilibria at rising heights,
         equally spaced, the first under an increasing force.
         """
-        rest, membrane, first = self.simulator.rest_positions[None], self.membrane, heights[:1]
+        rest = self.simulator.rest_positions[None]
+        membrane = self.membrane
+        first = heights[:1]
         away = (membrane.radius - rest[0, :, :2].norm(dim=1)) / (membrane.radius - membrane.cap)
         q = rest.clone()
         q[..., 2] += heights[0] * away.clamp(0.0, 1.0)

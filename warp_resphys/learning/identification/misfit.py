@@ -406,7 +406,9 @@ class NearbyMotion:
     def keep(self, unit: torch.Tensor, states: Sequence[State]) -> None:
         """Keeps states of the motion with parameters (P,), as fractions of their ranges."""
         small = sum(state.q.nbytes + state.v.nbytes for state in states) <= _MOST_BYTES
-        self._unit, self._states, self._count = unit, states if small else states[:1], len(states)
+        self._unit = unit
+        self._states = states if small else states[:1]
+        self._count = len(states)
 
     def states(self, unit: torch.Tensor) -> Sequence[State] | None:
         """Returns states with parameters (P,), if the last motion had these and they are kept."""

@@ -233,7 +233,9 @@ def search_parameters(
             f"the simulation failed at every start of the identification: {reason}", None, None
         )
     best = min(good, key=lambda attempt: attempt.loss)
-    unit, misfit.prior_weight, last = best.unit, best.prior_weight, is_last(best.loss)
+    unit = best.unit
+    misfit.prior_weight = best.prior_weight
+    last = is_last(best.loss)
     identified = Identification(
         parameters=misfit.from_unit(unit),
         loss=best.loss,

@@ -85,7 +85,9 @@ def sensitivities(
         identified: parameters and their uncertainty.
         batch: largest number of trials that are simulated together; None for all.
     """
-    simulator, found, moved = exact(simulator), dict[str, Sensitivity](), dict[str, float]()
+    simulator = exact(simulator)
+    found = dict[str, Sensitivity]()
+    moved = dict[str, float]()
     for name, word in _responses(motions.trials).items():
         inputs = motions.trials.inputs[name.removesuffix(f"_{word}")]
         moved = {name: 1.0 if word == "factor" else float(np.abs(inputs).max())} | moved
@@ -150,11 +152,11 @@ def _of_batch(
     rows = {parameter: row for row, parameter in enumerate(moved, 1)}
     of_parts = parameters_of_parts(simulator)
     for name in sets:
-        if (parameter := split_name(name)[0]) in moved:
+        parameter = split_name(name)[0]
+        if parameter in moved:
             sets[name][rows[parameter]] += moved[parameter]
-        if (
-            whole := of_parts.get(parameter, ("", 0))[0]
-        ) in moved and whole not in identified.parameters:
+        whole = of_parts.get(parameter, ("", 0))[0]
+        if whole in moved and whole not in identified.parameters:
             # What moves all parts moves each: factors relatively.
             sets[name][rows[whole]] += moved[whole] * (
                 sets[name][0] if whole.endswith("_factor") else 1.0
@@ -217,9 +219,8 @@ def parameter_spread(
                 identified.of_trials_deviation.get(value_name(parameter, owner))
                 for owner in (name, session)
             )
-            if (
-                known := next((value for value in of_trial if value is not None), None)
-            ) is not None:
+            known = next((value for value in of_trial if value is not None), None)
+            if known is not None:
                 deviation[at], correlation[at], correlation[:, at] = known, 0.0, 0.0
                 correlation[at, at] = 1.0
         root = deviation[:, None] * _root(correlation, deviation / ranges)
@@ -338,7 +339,8 @@ def free_fits(
             [x / size for x, size in zip(of, sizes, strict=True)]
             for of in ([errors[n] for n in members], places)
         )
-        if (best := _least(*scaled)) is not None:
+        best = _least(*scaled)
+        if best is not None:
             for name, slopes in zip(members, places, strict=True):
                 left[name]["places"] = mean(errors[name] + slopes @ best)
     return [

@@ -74,7 +74,9 @@ class WeakForm:
                 "there is no step to balance: give at least one motion, "
                 "and a stride of one or more."
             )
-        self._simulator, self._zero, self._stride = simulator, dict(zero), stride
+        self._simulator = simulator
+        self._zero = dict(zero)
+        self._stride = stride
         self._slow = replace(simulator, time_step=weight_step)
         self._stiff = self._slow.prepare(stiffness)
         self._motions = motions

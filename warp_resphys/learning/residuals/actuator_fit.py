@@ -282,7 +282,10 @@ class LinearisedTrainer(JudgedTrainer[Actuator]):
         epochs: int | None = None,
     ) -> None:
         super().__init__(model, None, train, judge, settings, epochs)
-        self._replays, self._felt, self._values, self._near = replays, felt, values, list(_NEAR)
+        self._replays = replays
+        self._felt = felt
+        self._values = values
+        self._near = list(_NEAR)
 
     @property
     @override

@@ -212,7 +212,9 @@ class Fitting:
                 "reconstruct them first."
             )
         arrays = self.reconstructed.of(names, "q", "v", "force", "error")
-        if (given := arrays[0].shape[2]) != (wanted := len(self.simulator.rest_positions)):
+        given = arrays[0].shape[2]
+        wanted = len(self.simulator.rest_positions)
+        if given != wanted:
             raise InputError(
                 f"forces on {given} vertices were reconstructed, "
                 f"but the body has {wanted}: do so for it."

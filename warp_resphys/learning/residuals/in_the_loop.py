@@ -66,7 +66,9 @@ class MotionLoss:
     def __init__(
         self, groups: Sequence[TrialGroup], parameters: Mapping[str, torch.Tensor]
     ) -> None:
-        self._groups, self._parameters, self.judged = groups, parameters, list[list[FloatArray]]()
+        self._groups = groups
+        self._parameters = parameters
+        self.judged = list[list[FloatArray]]()
         counts = [len(group.replay.trials.names) for group in groups]
         shares = [count / sum(counts) for count in counts]
         self.weights = [

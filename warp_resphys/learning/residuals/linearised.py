@@ -194,7 +194,9 @@ def chosen_penalty(
         loss_weights: (R,) of the squared errors of each group's trials.
         model: to fit.
     """
-    begin, best, least = copy.deepcopy(model.state_dict()), _PENALTIES[0], math.inf
+    begin = copy.deepcopy(model.state_dict())
+    best = _PENALTIES[0]
+    least = math.inf
     trials = torch.cat([torch.full_like(weights, 1.0) for weights in loss_weights]).cumsum(0) - 1.0
     folds = [trials % _FOLDS == number for number in range(min(_FOLDS, len(trials)))]
     fitted = [begin for _ in folds]

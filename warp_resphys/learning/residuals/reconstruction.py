@@ -72,7 +72,9 @@ class Reconstructor(ABC):
         observation: Observation,
         acts: Acts,
     ) -> None:
-        self.simulator, self.settings, self.acts = simulator, settings, acts
+        self.simulator = simulator
+        self.settings = settings
+        self.acts = acts
         self.regularisation = settings.regularisation
         self.observation = observation.to(simulator.rest_positions)
         if not isinstance(observation, WholeState):
@@ -204,7 +206,9 @@ class LBFGSB(Reconstructor):
         first_guess: torch.Tensor | None = None,
         read: Read | None = None,
     ) -> ReconstructedStep:
-        sim, like, acting = self.simulator, state.q, inputs or Inputs()
+        sim = self.simulator
+        like = state.q
+        acting = inputs or Inputs()
         free = sim.rest_positions.new_ones(sim.body.n_vertices, 1)
         free[sim.fixed] = 0.0
         whole = isinstance(self.observation, WholeState)
@@ -345,7 +349,8 @@ class ReconstructedTrials(Brief):
         Raises:
             InputError: a trial was not reconstructed.
         """
-        if missing := [name for name in names if name not in self.names]:
+        missing = [name for name in names if name not in self.names]
+        if missing:
             raise InputError(
                 f"the trial {missing[0]!r} was not reconstructed: there are "
                 f"{', '.join(self.names)}."

@@ -154,7 +154,10 @@ class FullStateProblem(StepProblem):
 
     @override
     def linearise(self, point: Point) -> Move:
-        step, weight, x, (force,) = self._step, self._weight, point.x, point.kept
+        step = self._step
+        weight = self._weight
+        x = point.x
+        (force,) = point.kept
         short = _SHORT * self.tolerance
         step.update(x)
         right = self._target - x - weight * step.product(force)
@@ -305,7 +308,8 @@ def load_reader(
         InputError: the zero is unknown, and the motion does not begin in equilibrium; or all
             vertices are observed.
     """
-    if not (sensors := replay.trials.sensors):
+    sensors = replay.trials.sensors
+    if not sensors:
         return None
     if isinstance(replay.observe, WholeState):
         raise InputError(

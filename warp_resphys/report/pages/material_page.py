@@ -97,7 +97,8 @@ def material_verdict(metrics: MaterialMetrics, law: LawContent, run: RunSettings
         [*terms, *([f"{branches} relaxing branch{'es' * (branches > 1)}"] if branches else [])]
     )
     notes = metrics.get("left_out", [])
-    if (factor := metrics.get("factor")) is not None:
+    factor = metrics.get("factor")
+    if factor is not None:
         return [*_scaled_verdict(metrics, factor), *notes]
     shown = {part: _mean(metrics, part) for part in _PARTS}
     part = "beyond" if shown["beyond"]["law"] is not None else "range"
@@ -141,7 +142,8 @@ def _scaled_verdict(metrics: MaterialMetrics, factor: float) -> list[str]:
             f"It predicts {len(known)} tests that it was not scaled to with an error of "
             f"{_percent(mean)} %, at most {_percent(known[worst])} % ({worst})."
         )
-    if lost := [name for name in held if name not in known]:
+    lost = [name for name in held if name not in known]
+    if lost:
         said.append(f"It has no equilibrium in {in_a_row(lost)}: give data.range lower heights.")
     return said
 
@@ -216,16 +218,16 @@ def draw_curves(tests: Mapping[str, SpecimenResult], canvas: Canvas) -> Drawn:
                 "label": "measured",
             },
         )
-        if (law := _in_kilopascals(result["curves"]["law"])) is not None and result[
-            "half_width"
-        ] is not None:
+        law = _in_kilopascals(result["curves"]["law"])
+        if law is not None and result["half_width"] is not None:
             half = 1e-3 * np.array(result["half_width"])
             band: dict[str, Any] = {"color": TONES["law"].light, "alpha": 0.18, "linewidth": 0.0}
             axis.fill_between(shown, law - half, law + half, **band, label="90 % interval")
         if law is not None:
             axis.plot(shown, law, color=TONES["law"].light, linewidth=1.8, label="law")
         for model, style in _STYLES.items():
-            if (values := _in_kilopascals(result["curves"].get(model))) is not None:
+            values = _in_kilopascals(result["curves"].get(model))
+            if values is not None:
                 line: dict[str, Any] = {
                     "color": TONES["muted"].light,
                     "linewidth": 1.1,

@@ -114,11 +114,12 @@ def picture_verdict(results: Sequence[PictureResult]) -> list[str]:
     doubts = [] if shown[0].tested else ["no pose was kept back"]
     if abs(errors["sysid"] - errors["simulation"]) < (1.0 - _BETTER) * errors["simulation"]:
         doubts.append("these poses hardly depend on the material, and do not test it")
-    if lost := [
+    lost = [
         result.pose
         for result in results
         if (common := result.overlap["sysid"]) is not None and common < _COVERED
-    ]:
+    ]
+    if lost:
         doubts.append(f"{listed(lost)} hardly overlap: check the camera, the mesh and the mask")
     advice = [f"Check before use: {'; '.join(doubts)}."] if doubts else []
     return [f"{text[0].upper()}{text[1:]}.", *advice]

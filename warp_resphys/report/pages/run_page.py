@@ -139,9 +139,10 @@ def _what_is_measured(data: RunReport) -> str:
 def _contributions(metrics: Metrics) -> list[str]:
     """Sentences on how bodies were held, and on the contribution of noise to errors, if known."""
     notes = []
-    if sideways := {
+    sideways = {
         trial: mm for fold in folds_in(metrics) for trial, mm in fold.get("sideways_mm", {}).items()
-    }:
+    }
+    if sideways:
         distances = ", ".join(
             f"{mm_text(distance)} ({trial})" for trial, distance in sideways.items()
         )

@@ -32,9 +32,9 @@ _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {
     "tendons": {"tension": TENSION, "contraction": CONTRACTION},
     "muscles": {"stress": STRESS, "contraction": MUSCLE_CONTRACTION},
 }
+_QUANTITIES: Final = (PRESSURE, *_COMMANDED["tendons"].values(), *_COMMANDED["muscles"].values())
 DRIVING_QUANTITIES: Final[Mapping[str, Quantity]] = {
-    quantity.name: quantity
-    for quantity in (PRESSURE, *(q for group in _COMMANDED.values() for q in group.values()))
+    quantity.name: quantity for quantity in _QUANTITIES
 }
 
 

@@ -206,9 +206,7 @@ def build_body(settings: BodySettings, mesh: Mesh | None = None) -> Body:
     """
     if mesh is not None:
         return _body(settings, mesh)
-    files = tuple(
-        _file_of(mesh) for mesh in (settings.mesh, *(part.mesh for part in settings.parts.values()))
-    )
+    files = tuple(_file_of(mesh) for mesh in settings.meshes)
     return _built_body(BodySettings.of(settings), files)
 
 

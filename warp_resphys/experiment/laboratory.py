@@ -113,18 +113,15 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
     parts = Parts.of(context, workers)
     parts.run(cut_up)
     setup = make_setup(settings)
-    seen = {
-        name: row
-        for part in cut_up
-        for name, *row in zip(
-            part.names, *(parts.read(part, key) for key in ("markers", "loads")), strict=True
-        )
-    }
+    seen = dict[str, tuple[FloatArray, FloatArray]]()
+    for part in cut_up:
+        markers, loads = parts.read(part, "markers"), parts.read(part, "loads")
+        seen |= dict(zip(part.names, zip(markers, loads, strict=True), strict=True))
     noise = [_record(context, setup, trial, *seen[trial.name]) for trial in trials]
     if all(trial.scale == 1.0 for trial in trials):
-        material, fibres, muscles = (
-            getattr(laboratory, key) for key in ("material", "fibres", "muscles")
-        )
+        material = laboratory.material
+        fibres = laboratory.fibres
+        muscles = laboratory.muscles
         wound = {} if fibres is None else {"fibre_stiffness": fibres.stiffness}
         wound |= {} if muscles is None else {"muscle_stiffness": muscles.stiffness}
         released = {trial.name: _drawn(settings, trial)[1] for trial in trials}

@@ -4,6 +4,7 @@ import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,8 @@ _REACH = 2.0
 
 def material_stages(run: RunSettings, data: MaterialTestData) -> list[Stage]:
     """Returns the stages of a run with some tests."""
-    files = {str(path): digest(path) for paths in table_files(data).values() for path in paths}
+    paths = chain.from_iterable(table_files(data).values())
+    files = {str(path): digest(path) for path in paths}
     if run.law is not None and run.law.file is not None:
         files[run.law.file] = digest(law_path(run.law.file))
     settings = StageSettings.reading(run, "simulation", "law", "data", "seed", "name", files=files)
@@ -155,7 +157,8 @@ def tests_of(
                         path, called, data, wanted, poissons_ratio, random
                     )
             notes += [f"{called}: {note}" for note in said]
-    notes += [f"{name}: {note}" for name, test in (fitted | held).items() for note in test.left_out]
+    for name, test in (fitted | held).items():
+        notes += [f"{name}: {note}" for note in test.left_out]
     return fitted, held, notes
 
 
@@ -177,7 +180,11 @@ def _inflated(
                 "give heights that were measured."
             )
         membrane = Membrane(
-            *(wanted.radius, table.thickness, table.cap, force, table.rings),
+            radius=wanted.radius,
+            thickness=table.thickness,
+            cap=table.cap,
+            force=force,
+            rings=table.rings,
             ring_modulus=wanted.ring_modulus,
             poissons_ratio=poissons_ratio,
         )
@@ -219,13 +226,14 @@ def _deformed(
         notes = [*table.notes]
     else:
         assert data.simulated is not None
-        (strain, stress), seconds = (
-            _played(wanted.kind, specimen, simulated, data.simulated, random),
-            None,
-        )
+        strain, stress = _played(wanted.kind, specimen, simulated, data.simulated, random)
+        seconds = None
     counted = _counted(strain, data, name)
     test = MaterialTest(
-        *(wanted.kind, strain, stress, seconds),
+        kind=wanted.kind,
+        strain=strain,
+        stress=stress,
+        seconds=seconds,
         toe=wanted.toe,
         compliance=wanted.compliance * specimen.area / size.length,
         specimen=simulated,

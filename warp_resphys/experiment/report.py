@@ -158,7 +158,7 @@ class RunReader:
         # (K + 1, R, O) inputs, by name
         moved = self.dataset.contact_at(trials.names, body, self.dataset.time_step)
         assert run.tip is not None
-        names = {name for result in identification.values() for name in result.parameters}
+        names = set[str]().union(*(result.parameters for result in identification.values()))
         histories = (
             (m, read_if_there(path).get("epochs"))
             for m, path in training_files(self.folder, run).items()

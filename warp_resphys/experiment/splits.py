@@ -2,7 +2,7 @@
 and their split into training, validation and test.
 """
 
-from itertools import islice
+from itertools import chain, islice, product
 from pathlib import Path
 from typing import Any, Final
 
@@ -160,7 +160,7 @@ def _valued(data: SimulatedData) -> dict[str, list[str]]:
         raise InputError(
             f"data.{key}.{empty[0]} is empty: give the split at least one value, in {unit.strip()}."
         )
-    names = [name for row in named.values() for name in row]
+    names = [*chain.from_iterable(named.values())]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise InputError(f"data.{key} names {twice[0]} twice: a trial belongs to one split only.")
@@ -198,12 +198,8 @@ def _named(run: RunSettings) -> dict[str, list[str]]:
     rest, lists = iter(names), dict[str, list[str]]()
     open_ends = [name for name, members in wanted.items() if members == OTHERS]
     if open_ends:
-        taken = [
-            member
-            for members in wanted.values()
-            if not isinstance(members, int | str)
-            for member in members
-        ]
+        given = [members for members in wanted.values() if not isinstance(members, int | str)]
+        taken = [*chain.from_iterable(given)]
         if len(open_ends) > 1 or asked:
             raise InputError(
                 f"{group}.{open_ends[0]} is others, the trials that the other two do not name: "
@@ -222,7 +218,8 @@ def _named(run: RunSettings) -> dict[str, list[str]]:
             more = ", or set data.folds to leave_one_out" if group == "data" else ""
             raise InputError(f"{group}.{name} is empty: add at least one of {table}.trials{more}.")
     seen: dict[str, str] = {}
-    for name, trial in ((name, trial) for name, members in lists.items() for trial in members):
+    of_splits = [(name, trial) for name, members in lists.items() for trial in members]
+    for name, trial in of_splits:
         # The remainder of a partly trained trial is tested.
         if trial in seen and not (
             run.train_fraction < 1.0 and (seen[trial], name) == ("train", "test")
@@ -288,8 +285,7 @@ def scaled_trials_of(run: RunSettings) -> tuple[Trial, ...]:
     test = [trials[name] for name in split_of(run).test]
     return tuple(
         trial.model_copy(update={"name": scaled_name(trial.name, scale), "scale": scale})
-        for scale in run.input_scales
-        for trial in test
+        for scale, trial in product(run.input_scales, test)
     )
 
 

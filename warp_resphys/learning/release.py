@@ -32,9 +32,10 @@ _FURTHEST, _TRIED = 3.0, 121
 _DELAYS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # starts of the search, in expected deviations
 _HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of the first J^T J
 _ITERATIONS = 4  # of Levenberg-Marquardt, at most
+# In expected deviations.
 _RELEASE_TOLERANCE = 1e-4
 _DIFFERENCE = 0.05
-_LONGEST_STEP = 3.0  # in expected deviations
+_LONGEST_STEP = 3.0
 
 
 def estimate_release(

@@ -436,8 +436,8 @@ class Replay:
         """Yields positions (E R, N, 3) of `varied_series` [m],
         and readings, from the release on.
         """
-        (constants, inputs, resting) = first
-        (their, their_inputs, their_resting) = others
+        constants, inputs, resting = first
+        their, their_inputs, their_resting = others
         state = states[0]
         if not start.at_rest:
             whole = self.initial_state(start, constants, resting, 1 + sets)

@@ -141,11 +141,11 @@ class MaterialSettings(_Parameters):
         """Values by parameter of the simulator, such
         as ``tip_youngs_modulus`` for a region ``tip``.
         """
-        return {
-            f"{region}_{name}" if region else name: value
-            for region, material in self.by_region.items()
-            for name, value in material.values.items()
-        }
+        found = dict[str, float]()
+        for region, material in self.by_region.items():
+            prefix = f"{region}_" if region else ""
+            found |= {f"{prefix}{name}": value for name, value in material.values.items()}
+        return found
 
 
 class PartSettings(Settings):

@@ -3,6 +3,7 @@ how they follow the body, and their registration.
 """
 
 import math
+from itertools import product
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
@@ -113,7 +114,7 @@ class BindingSettings(Settings):
         """Labels of the M observed points: tracked markers, then four points of each rigid body."""
         return (
             *self.tracked,
-            *(f"{name} {corner}" for name in self.rigid_bodies for corner in CORNERS),
+            *(f"{name} {corner}" for name, corner in product(self.rigid_bodies, CORNERS)),
         )
 
 

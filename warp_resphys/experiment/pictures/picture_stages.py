@@ -10,6 +10,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -91,9 +92,8 @@ def picture_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
     if data.folder is None:
         of_poses = {pose.folder: [SCENE, pose.points] for pose in data.poses.values()}
         for pose in data.poses.values():
-            of_poses[pose.folder] += [
-                file for files in frame_files(data, pose) for file in files.values()
-            ]
+            for files_of_frame in frame_files(data, pose):
+                of_poses[pose.folder] += files_of_frame.values()
         written = tuple(
             f"recordings/{folder}/{file}"
             for folder, files in of_poses.items()
@@ -206,7 +206,7 @@ class _Plan:
                 "all": [""],
                 "material": [pose.material for pose in poses],
                 "trial": [pose.name for pose in poses],
-                "lens": [lens for pose in poses for lens in pose.lenses],
+                "lens": [*chain.from_iterable(pose.lenses for pose in poses)],
             }
             shared = limits.owner or "all"
             for owner in dict.fromkeys(owners[shared]) if chosen(name, shared) else ():
@@ -360,15 +360,13 @@ def identify_pictures(context: StageContext) -> None:
         lambda before: (misfit, first_points(misfit, *first)), *options, starts=wanted.starts
     )
     result = replace(found, first_guess=guess).plain()
-    cameras = {
-        pose.name: {
+    cameras = {}
+    for pose in poses if settings.data.stands else ():
+        cameras[pose.name] = {
             photo.lens: photo.camera.pose.tolist()
             for photo in pose.photos
             if photo.camera.lens is not None
         }
-        for pose in poses
-        if settings.data.stands
-    }
     write_json(context.run_dir / IDENTIFICATION, {"sysid": result, "cameras": cameras})
     for material in dict.fromkeys(pose.material for pose in poses):
         pose = next(pose for pose in poses if pose.material == material)

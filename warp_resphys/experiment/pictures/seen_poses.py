@@ -5,6 +5,7 @@ and the files of pictures to `SeenPose`.
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -80,7 +81,7 @@ def picture_files(data: PictureData) -> dict[str, str]:
         beside = [pose.mesh, pose.points, pose.cloud]
         paths += [scene.path] if scene.path.exists() else []
         paths += [scene.path.parent / name for name in beside if name is not None]
-        paths += [path for frame in scene.frames for path in frame.files]
+        paths += chain.from_iterable(frame.files for frame in scene.frames)
     result = {}
     for path in paths:
         try:
@@ -206,7 +207,9 @@ def _without_copies(scene: SceneFile, name: str) -> SceneFile:
     if len(different) < len(scene.frames):
         log.warning(
             "import: %d of the %d pictures of %s are copies of others, and are left out",
-            *(len(scene.frames) - len(different), len(scene.frames), name),
+            len(scene.frames) - len(different),
+            len(scene.frames),
+            name,
         )
     return replace(scene, frames=(*different.values(),))
 

@@ -9,6 +9,7 @@ during which inputs are constant.
 import logging
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -213,8 +214,11 @@ def _mountings(
         log.info(
             "import: %s is mounted %.1f mm from the centre of what carries it, turned by %.1f "
             "degrees; the trials differ from this by up to %.2f mm and %.2f degrees",
-            *(name, _MILLI * np.linalg.norm(np.mean(bound[corners] - nominal, axis=0))),
-            *(np.degrees(angles(nominal, bound[corners])), away.max(), turned.max()),
+            name,
+            _MILLI * np.linalg.norm(np.mean(bound[corners] - nominal, axis=0)),
+            np.degrees(angles(nominal, bound[corners])),
+            away.max(),
+            turned.max(),
         )
     return mountings
 
@@ -298,15 +302,10 @@ def _dataset(
         if UNDER_INPUTS in begins:
             first = [r.actuation[0] for r in recorded.moving if r.actuation is not None]
             driven["resting"] = {name: np.array(first)}
-    obstacles = {
-        name: _motion(
-            recorded,
-            f"the obstacle {name!r}",
-            [r.obstacles.get(name) for r in recorded.moving],
-            at_steps,
-        )
-        for name in dict.fromkeys(name for r in recorded.moving for name in r.obstacles)
-    }
+    obstacles = {}
+    for name in dict.fromkeys(chain.from_iterable(r.obstacles for r in recorded.moving)):
+        poses = [r.obstacles.get(name) for r in recorded.moving]
+        obstacles[name] = _motion(recorded, f"the obstacle {name!r}", poses, at_steps)
     sessions = tuple(trial.session or "" for trial in trials)
     return Trials(
         names=tuple(trial.name for trial in trials),
@@ -415,7 +414,8 @@ def _inputs(recorded: RegisteredTrials, steps: int, parts: int) -> FloatArray:
         log.warning(
             "import: recordings are shorter than the %d steps of data.steps (%s); "
             "missing frames are ignored.",
-            *(steps, ", ".join(short)),
+            steps,
+            ", ".join(short),
         )
     return inputs
 

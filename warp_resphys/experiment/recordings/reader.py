@@ -417,7 +417,9 @@ class Reader:
             log.info(
                 "import: the markers of %s are assigned by their places, to %.1f mm (next best "
                 "assignment: %.1f mm)",
-                *(trial.name, _MILLI * rms, _MILLI * next_rms),
+                trial.name,
+                _MILLI * rms,
+                _MILLI * next_rms,
             )
             rest = None if recording.rest is None else recording.rest[columns]
             positions = recording.positions[:, columns]

@@ -125,7 +125,9 @@ class RegisteredTrials(Reader):
             log.info(
                 "import: %s has %g frames per second and the simulation %g steps: simulated "
                 "motions are interpolated at the frames",
-                *(recording.source.name, recording.rate, 1.0 / self.settings.time_step),
+                recording.source.name,
+                recording.rate,
+                1.0 / self.settings.time_step,
             )
         if trial.begins == "released":
             return recording, _START
@@ -369,7 +371,9 @@ class RegisteredTrials(Reader):
                 [view.of_arrays(places[:count] @ rotation.T) @ rotation, places[count:]]
             )
         return register_markers(
-            *(places, expected, recording.labels),
+            places,
+            expected,
+            recording.labels,
             source=recording.source,
             largest_residual=self.markers.largest_residual,
             use=use,

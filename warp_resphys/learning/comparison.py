@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import chain
+from itertools import chain, product
 from typing import Any, Final
 
 import numpy as np
@@ -90,7 +90,7 @@ class Comparison:
     @property
     def names(self) -> list[str]:
         """Names of all tested trials."""
-        return [name for group in self.groups.values() for name in group]
+        return [*chain.from_iterable(self.groups.values())]
 
     @cached_property
     def _largest(self) -> list[str]:
@@ -239,7 +239,7 @@ class Comparison:
     def _in_order(self, model: str, name: str) -> Any:
         """An array of the roll-outs of a model, (R, ...) in the order of the tested trials."""
         parts = self._rolled_out[0][model]
-        order = [trial for part in parts for trial in part.names]
+        order = [*chain.from_iterable(part.names for part in parts)]
         rows = [order.index(trial) for trial in self.names]
         if name in ("observed", "loads"):
             return self.parts.joined(parts, name, self.motions.trials.observed.shape[1])[rows]
@@ -250,11 +250,8 @@ class Comparison:
         """First frames of trials from which values of some model were estimated, see
         `Identified`.
         """
-        return {
-            o: shown
-            for model in self.models.values()
-            for o, shown in model.identified.first_frames.items()
-        }
+        shown = [model.identified.first_frames for model in self.models.values()]
+        return dict(chain.from_iterable(frames.items() for frames in shown))
 
     @cached_property
     def _without_physics(self) -> tuple[dict[str, FloatArray], dict[str, str], dict[str, str]]:
@@ -482,7 +479,8 @@ def _loads_as_points(motions: ObservedMotions) -> ObservedMotions:
     """
     trials = motions.trials
     readings = np.stack([*trials.loads.values()], 2).reshape(*trials.times.shape, -1, 3)
-    names = tuple(f"{name} {kind}" for name in trials.loads for kind in ("force", "moment"))
+    kinds = product(trials.loads, ("force", "moment"))
+    names = tuple(f"{name} {kind}" for name, kind in kinds)
     known = np.isfinite(readings)
     # NaN where there is none
     first = np.take_along_axis(readings, known.argmax(axis=1)[:, None], axis=1)[:, 0]

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from itertools import islice
+from itertools import chain, islice
 from typing import Any, Final
 
 import numpy as np
@@ -86,7 +86,8 @@ def evaluate(
         )
     cut_up = rollout_parts(simulator, motions, names, force, parameters, parts.batch)
     parts.run(cut_up)
-    order, rows = [name for part in cut_up for name in part.names], trials.rows(names)
+    order = [*chain.from_iterable(part.names for part in cut_up)]
+    rows = trials.rows(names)
     used = torch.from_numpy(used_frames(trials, names, Identified.of(parameters).first_frames))
     array = "observed" if sensor is None else "loads"
     made = parts.joined(cut_up, array, trials.observed.shape[1])[
@@ -387,7 +388,7 @@ def used_frames(
     """(R, T) whether values were estimated from a frame of some trials, see
     `Identified.first_frames`.
     """
-    seconds = {name: until for shown in first_frames.values() for name, until in shown.items()}
+    seconds = dict(chain.from_iterable(shown.items() for shown in first_frames.values()))
     last = np.array([seconds.get(name, -math.inf) for name in names])
     return np.asarray(trials.times[trials.rows(names)] <= last[:, None] + 1e-9)
 
@@ -449,15 +450,16 @@ class HeldOutRollouts:
     @property
     def names(self) -> list[str]:
         """Names of the trials, in the order of the errors."""
-        return [name for batch in self.batches for name in batch]
+        return [*chain.from_iterable(self.batches)]
 
     def amplitudes_mm(self) -> list[float]:
         """Amplitudes of the trials [mm]."""
-        return [1e3 * size for run in self._runs for size in run.replay.trials.amplitude.tolist()]
+        sizes = (run.replay.trials.amplitude.tolist() for run in self._runs)
+        return [1e3 * size for size in chain.from_iterable(sizes)]
 
     def errors(self, learned: Learned | None) -> list[FloatArray]:
         """Mean distances of the points of each trial by frame [mm], see `TrialRollout.errors`."""
-        return [row for run in self._runs for row in run.errors(learned)]
+        return [*chain.from_iterable(run.errors(learned) for run in self._runs)]
 
     def error_mm(self, learned: Learned) -> float:
         """Mean error of a network over the trials [mm]; infinite if a roll-out diverged."""

@@ -113,7 +113,9 @@ def by_part(
     shared = {
         name: value for name, value in values.items() if name in ranges and ranges[name].by_part
     }
-    found = {part: value for name, value in shared.items() for part in names.get(name, [name])}
+    found = dict[str, T]()
+    for name, value in shared.items():
+        found |= dict.fromkeys(names.get(name, [name]), value)
     return found | {name: value for name, value in values.items() if name not in shared}
 
 

@@ -230,9 +230,7 @@ class _FirstFrames(Problem):
         self._shapes = sideways_shapes(replay.simulator) if settings.sideways > 0.0 else none
         self._sizes = (int(settings.delay > 0.0), len(self._shapes))
         deviations, self._copies = (settings.delay, settings.sideways), dict[int, Replay]()
-        self.deviation = held.new_tensor(
-            [d for d, n in zip(deviations, self._sizes, strict=True) for _ in range(n)]
-        )
+        self.deviation = held.new_tensor(np.repeat(deviations, self._sizes))
 
     def release(self, values: torch.Tensor) -> Start:
         """Returns the releases for values (k R, unknowns); the R motions run fastest."""

@@ -50,11 +50,8 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         blocks.append(canvas.figure("error_over_time", figure, alt, _error_caption(data, window)))
     by_model = metrics.get("per_marker")
     if by_model:
-        shown = [
-            label
-            for label in trials.labels
-            if any(label in markers for markers in by_model.values())
-        ]
+        known = set[str]().union(*by_model.values())
+        shown = [label for label in trials.labels if label in known]
         by_label = {
             label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown
         }

@@ -10,6 +10,7 @@ the kernels.
 
 import re
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -210,7 +211,7 @@ def not_needed_text(law: LawContent, settings: LawSettings) -> str:
     """
     parameters = {name: value for name, value in law["parameters"].items() if value}
     names = [name for name in settings.terms if name not in parameters]
-    exponents = [str(n) for name in names for n in ogden_terms({name: 0.0})]
+    exponents = [*map(str, chain.from_iterable(ogden_terms({name: 0.0}) for name in names))]
     absent = [
         within_sentence(wording(name)[0][0]) for name in names if not ogden_terms({name: 0.0})
     ]
@@ -314,10 +315,8 @@ def _curve(data: RunReport, parameters: Mapping[str, float], canvas: Canvas) -> 
         label=f"E at small strains, {modulus:.3g} kPa",
     )
     axes.axhline(0.0, color=TONES["muted"].light, linewidth=0.6)
-    low, high = (
-        extreme([extreme(stress) for stress in curves.values()])
-        for extreme in (np.nanmin, np.nanmax)
-    )
+    low = np.nanmin([np.nanmin(stress) for stress in curves.values()])
+    high = np.nanmax([np.nanmax(stress) for stress in curves.values()])
     margin = 0.1 * (high - low)
     axes.set(xlim=(stretches[0], stretches[-1]), ylim=(low - margin, high + margin))
     axes.set(xlabel="stretch", ylabel="nominal stress [kPa]")

@@ -6,6 +6,7 @@ alike. What speaks against relying on the verdict are its `conditions`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from statistics import fmean
 from typing import Final
 
@@ -86,23 +87,16 @@ def results_table(metrics: Metrics, settings: RunSettings) -> PageTable:
     if named:
         cells = [columns[title].get(model, Cell("")) for title, model in plain.items()]
         rows.append(Row(f"without physics ({', '.join(named)})", cells, mark * (best in BASELINES)))
-    rows += [
-        Row(
-            text,
-            [by_model.get(model, Cell("")) for by_model in columns.values()],
-            mark * (model == best),
-        )
-        for model, text in _ROWS.items()
-        if any(model in by_model for by_model in columns.values())
-    ]
+    shown = set[str]().union(*columns.values())
+    for model, text in _ROWS.items():
+        if model in shown:
+            cells = [by_model.get(model, Cell("")) for by_model in columns.values()]
+            rows.append(Row(text, cells, mark * (model == best)))
     of = "vertices" if settings.markers is None else "markers"
     lacking = [f"{model_words(model)} ({why})" for model, why in missing_baselines(metrics).items()]
     note = f"Missing: {'; '.join(lacking)}." if lacking else ""
-    first = {
-        owner: shown
-        for fold in folds_in(metrics)
-        for owner, shown in fold.get("first_frames", {}).items()
-    }
+    of_folds = (fold.get("first_frames", {}) for fold in folds_in(metrics))
+    first = dict(chain.from_iterable(frames.items() for frames in of_folds))
     note = " ".join(filter(None, (note, first_frames_text(first))))
     return PageTable(f"{settings.heading}: mean error of the {of} [mm]", list(columns), rows, note)
 

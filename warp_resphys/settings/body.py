@@ -310,6 +310,11 @@ class BodySettings(Settings):
             )
         return self
 
+    @property
+    def meshes(self) -> tuple[MeshSettings, ...]:
+        """The mesh and those of the parts."""
+        return (self.mesh, *(part.mesh for part in self.parts.values()))
+
 
 class SteppedSettings(BodySettings):
     """A body and its time integration."""

@@ -26,6 +26,7 @@ from ...io.resuming import Stage, StageContext, package_versions, resources_used
 from ...io.safe_files import atomic_hdf5, create, read_json, write_json
 from ...learning.identification.search import (
     Identification,
+    Searches,
     first_points,
     refined_searches,
     search_parameters,
@@ -350,15 +351,14 @@ def identify_pictures(context: StageContext) -> None:
     misfit = PictureMisfit(poses, bounds, plan.clamp_turns(poses))
     guess, kept = plan.guess(bounds, poses), context.run_dir / f"{context.name}_parts.safetensors"
     first = (guess, wanted.starts, wanted.candidates, settings.seed)
-    options = (
+    searches = Searches(
         wanted.max_evaluations,
         wanted.tolerance,
         Checkpoint(kept, context.fingerprint),
         context.name,
+        starts=wanted.starts,
     )
-    (found,) = refined_searches(
-        lambda before: (misfit, first_points(misfit, *first)), *options, starts=wanted.starts
-    )
+    (found,) = refined_searches(lambda before: (misfit, first_points(misfit, *first)), searches)
     result = replace(found, first_guess=guess).plain()
     cameras = {}
     for pose in poses if settings.data.stands else ():

@@ -20,7 +20,7 @@ them.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Final
 
 import numpy as np
@@ -222,7 +222,8 @@ def identify_from_tests(
         )
     for name, test in tests.items():
         test.check(name)
-    groups = [chosen for size in range(_LARGEST_CLASS + 1) for chosen in combinations(terms, size)]
+    sizes = range(_LARGEST_CLASS + 1)
+    groups = [*chain.from_iterable(combinations(terms, size) for size in sizes)]
     lower = [test.lower for test in tests.values()]
     tried, classes = [search.fit(chosen, lower) for chosen in groups], list[TriedClass]()
     for chosen, fit in zip(groups, tried, strict=True):

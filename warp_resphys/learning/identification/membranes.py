@@ -17,7 +17,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Final
 
 import numpy as np
@@ -96,11 +96,8 @@ class Membrane(Brief):
                 raise InputError(
                     f"{name} of a membrane is {size:g}: give a positive number, in SI units."
                 )
-        edges = [
-            self.cap,
-            *(edge for r, half in self.rings for edge in (r - half, r + half)),
-            self.radius,
-        ]
+        of_rings = chain.from_iterable((r - half, r + half) for r, half in self.rings)
+        edges = [self.cap, *of_rings, self.radius]
         if any(not low < high for low, high in pairwise(edges)):
             shown = ", ".join(f"{1e3 * edge:.4g}" for edge in edges)
             raise InputError(

@@ -307,13 +307,12 @@ class Misfit(BoundedMisfit):
         """(S, R, P) one where a motion of `_moves_of` changes a parameter of a trial, else zero."""
         owners = np.zeros((len(self._moves), len(trials.names), len(self.bounds)))
         names = [split_name(name)[1] for name in self.bounds]
-        for number, column in (
-            (number, column) for number, moved in enumerate(self._moves) for column in moved
-        ):
-            owner = names[column]
-            owners[number, :, column] = [
-                not owner or owner in (t, trials.session) for t in trials.names
-            ]
+        for number, moved in enumerate(self._moves):
+            for column in moved:
+                owner = names[column]
+                owners[number, :, column] = [
+                    not owner or owner in (t, trials.session) for t in trials.names
+                ]
         return owners
 
     @property

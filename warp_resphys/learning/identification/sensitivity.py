@@ -11,6 +11,7 @@ did.
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, product
 from typing import Any, TypedDict
 
 import numpy as np
@@ -65,7 +66,7 @@ class Sensitivity:
 def _responses(trials: Trials) -> dict[str, str]:
     """Parameters for a scale and a zero of inputs that drive trials, by name, with their word."""
     driven = [name for name, values in trials.inputs.items() if name not in HUNG and values.any()]
-    return {f"{name}_{word}": word for name in driven for word in ("factor", "zero")}
+    return {f"{name}_{word}": word for name, word in product(driven, ("factor", "zero"))}
 
 
 def sensitivities(
@@ -110,9 +111,8 @@ def sensitivities(
         Progress("Differentiating the test trials", len(names), "trials") as progress,
         torch.no_grad(),
     ):
-        for _, some in (
-            part for whole in motions.trials.batches(names) for part in cut(whole, batch)
-        ):
+        whole = motions.trials.batches(names)
+        for _, some in chain.from_iterable(cut(alike, batch) for alike in whole):
             for shared in in_threads(
                 differentiated, [part for k in range(threads) if (part := some[k::threads])]
             ):
@@ -221,7 +221,9 @@ def parameter_spread(
             )
             known = next((value for value in of_trial if value is not None), None)
             if known is not None:
-                deviation[at], correlation[at], correlation[:, at] = known, 0.0, 0.0
+                deviation[at] = known
+                correlation[at] = 0.0
+                correlation[:, at] = 0.0
                 correlation[at, at] = 1.0
         root = deviation[:, None] * _root(correlation, deviation / ranges)
         slopes = np.stack(
@@ -335,11 +337,8 @@ def free_fits(
             continue
         # Trials count alike.
         sizes = [float(np.sqrt(np.nanmean(np.square(errors[name])))) or 1.0 for name in members]
-        scaled = (
-            [x / size for x, size in zip(of, sizes, strict=True)]
-            for of in ([errors[n] for n in members], places)
-        )
-        best = _least(*scaled)
+        scaled = [errors[n] / size for n, size in zip(members, sizes, strict=True)]
+        best = _least(scaled, [x / size for x, size in zip(places, sizes, strict=True)])
         if best is not None:
             for name, slopes in zip(members, places, strict=True):
                 left[name]["places"] = mean(errors[name] + slopes @ best)

@@ -7,6 +7,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any
 
 import torch
@@ -350,7 +351,7 @@ class Fitting:
                 f"{name}: held out", len(train) * loop.epochs, "epochs at most"
             ) as progress:
                 epochs, (below, errors) = cross_validated_epochs(parts, progress.advance)
-            sizes = [size for part in parts for size in part.judge.amplitudes_mm()]
+            sizes = [*chain.from_iterable(part.judge.amplitudes_mm() for part in parts)]
             test = (
                 held_out_test(train, HELD_OUT, errors, below, sizes)
                 if settings.trainer.gate

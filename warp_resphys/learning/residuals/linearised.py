@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Final
 
 import torch
@@ -59,7 +60,7 @@ class Linearised:
         replay = replay.changed(actuator=model.inputs)
         states, prepared = replay.states(start, parameters), replay.prepare(parameters)
         sizes = {name: _CHANGE * network.unit for name, network in model.inputs.items()}
-        columns = [name for name in sizes for _ in range(model.inputs[name].parts)]
+        columns = [*chain.from_iterable([name] * model.inputs[name].parts for name in sizes)]
         # The derivatives by lasting changes have no transients then.
         settles = start.at_rest and not replay.is_static
         random = _random_changes(prepared[1], sizes, replay.simulator.time_step) if settles else {}

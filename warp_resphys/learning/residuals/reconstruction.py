@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from typing import Any, Final, Self
 
 import numpy as np
@@ -399,9 +399,8 @@ def reconstruct(
             work = partial(_reconstructed, used, motions, batch, known, wanted, acts)
             cut_up.append(TrialPart(f"part{number}_{first:03d}", batch, frames, work))
     parts.run(cut_up)
-    return ReconstructedTrials(
-        tuple(name for part in cut_up for name in part.names), partial(parts.joined, cut_up)
-    )
+    names = chain.from_iterable(part.names for part in cut_up)
+    return ReconstructedTrials(tuple(names), partial(parts.joined, cut_up))
 
 
 def _reconstructed(

@@ -4,6 +4,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import ClassVar
 
 import torch
@@ -332,7 +333,8 @@ def load_reader(
             off = torch.nan if replay.is_static else loads[:, 0, number] - first
             loads[:, :, number] -= off if isinstance(off, float) else off[:, None]
     trials = replace(replay.trials, sensors=tuple(replace(sensor, zero=0.0) for sensor in sensors))
-    measured = [math.isfinite(deviation) for sensor in sensors for deviation in sensor.deviations]
+    deviations = chain.from_iterable(sensor.deviations for sensor in sensors)
+    measured = [*map(math.isfinite, deviations)]
 
     def read(before: State, after: State, number: int) -> torch.Tensor:
         now = 0 if replay.is_static else number + 1

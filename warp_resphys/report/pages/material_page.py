@@ -80,11 +80,8 @@ def specimen_table(metrics: MaterialMetrics) -> PageTable:
 
 def _models(metrics: MaterialMetrics) -> list[str]:
     """Returns the models of the tests, in their order."""
-    return [
-        model
-        for model in _MODELS
-        if any(model in one["errors"]["range"] for one in metrics["tests"].values())
-    ]
+    known = set[str]().union(*(one["errors"]["range"] for one in metrics["tests"].values()))
+    return [model for model in _MODELS if model in known]
 
 
 def material_verdict(metrics: MaterialMetrics, law: LawContent, run: RunSettings) -> list[str]:
@@ -209,14 +206,13 @@ def draw_curves(tests: Mapping[str, SpecimenResult], canvas: Canvas) -> Drawn:
     for axis, (name, result) in zip(axes, tests.items(), strict=False):
         shown = 100.0 * np.array(result["shown"])
         axis.plot(
-            *(100.0 * np.array(result["strain"]), 1e-3 * np.array(result["stress"])),
-            **{
-                "linestyle": "",
-                "marker": ".",
-                "markersize": 3.0,
-                "color": TONES["ink"].light,
-                "label": "measured",
-            },
+            100.0 * np.array(result["strain"]),
+            1e-3 * np.array(result["stress"]),
+            linestyle="",
+            marker=".",
+            markersize=3.0,
+            color=TONES["ink"].light,
+            label="measured",
         )
         law = _in_kilopascals(result["curves"]["law"])
         if law is not None and result["half_width"] is not None:
@@ -306,21 +302,17 @@ def _machines(metrics: MaterialMetrics) -> list[Block]:
         "toe": ("%", 100.0),
         "compliance": ("% of the length per MPa", 1e8),
     }
-    names = [
-        name for name in units if any(name in machine for machine in metrics["machines"].values())
-    ]
+    known = set[str]().union(*metrics["machines"].values())
+    names = [name for name in units if name in known]
     if not names:
         return []
-    rows = [
-        Row(
-            test,
-            [
-                Cell(significant(units[name][1] * machine[name], 3) if name in machine else NONE)
-                for name in names
-            ],
-        )
-        for test, machine in metrics["machines"].items()
-    ]
+    rows = []
+    for test, machine in metrics["machines"].items():
+        cells = [
+            Cell(significant(units[name][1] * machine[name], 3) if name in machine else NONE)
+            for name in names
+        ]
+        rows.append(Row(test, cells))
     return [
         PageTable("Machine", [f"{name.capitalize()} [{units[name][0]}]" for name in names], rows)
     ]

@@ -4,6 +4,7 @@ their distances, and the parameters.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -316,9 +317,8 @@ def draw_clouds(
                 if f"{_FIRST}_places" in file[f"{result.pose}/{frame}"]
             )
             clouds.append((result, _seen_from_the_side(file[f"{result.pose}/{number}"], up)))
-    most = max(
-        float(np.quantile(distances, _SHOWN)) for _, seen in clouds for _, distances, _ in seen[1:]
-    )
+    identified = chain.from_iterable(seen[1:] for _, seen in clouds)
+    most = max(float(np.quantile(distances, _SHOWN)) for _, distances, _ in identified)
     figure = Figure(
         figsize=(len(_MODELS) * _CLOUD_PANEL, len(clouds) * _CLOUD_PANEL * 0.8),
         layout="constrained",
@@ -326,9 +326,8 @@ def draw_clouds(
     axes = figure.subplots(len(clouds), len(_MODELS), squeeze=False)
     dots = None
     for (result, seen), row in zip(clouds, axes, strict=True):
-        ends = np.concatenate(
-            [part.reshape(-1, 2) for places, _, body in seen for part in (places, body)]
-        )
+        drawn = chain.from_iterable((places, body) for places, _, body in seen)
+        ends = np.concatenate([part.reshape(-1, 2) for part in drawn])
         low, high = _frame_of(ends, _CLOUD_MARGIN * float(np.ptp(ends, axis=0).max()))
         for model, axis, (places, distances, body) in zip(_MODELS, row, seen, strict=True):
             axis.add_collection(
@@ -352,10 +351,11 @@ def draw_clouds(
         "of their distances: the undeformed body, the simulator with the parameters of the data "
         "sheet, and the identified one."
     )
-    alt = "; ".join(
-        f"{result.pose}: {', '.join(_text(result.cloud_mm[model]) for model in _MODELS)} mm"
-        for result, _ in panels
-    )
+    texts = []
+    for result, _ in panels:
+        distances_mm = ", ".join(_text(result.cloud_mm[model]) for model in _MODELS)
+        texts.append(f"{result.pose}: {distances_mm} mm")
+    alt = "; ".join(texts)
     return Drawn.of(
         path, f"Clouds of points on bodies. Mean distances of the three models: {alt}.", caption
     )

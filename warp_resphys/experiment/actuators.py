@@ -181,9 +181,8 @@ def _driving(settings: BodySettings) -> tuple[Quantity, int] | None:
         if energy.inputs:
             driving[f"energies.{name}"] = energy.inputs[0], energy.count
     if len(driving) > 1:
-        first, second, *_ = driving
         raise InputError(
-            f"{first} and {second} are two inputs of the body, "
+            f"{' and '.join([*driving][:2])} are two inputs of the body, "
             "but recordings have one: take one out."
         )
     return next(iter(driving.values()), None)

@@ -415,7 +415,8 @@ def left_out_in_turn(
     alike = [batch for batch in trials.batches(names) if len(batch) > 1]
     count = min(max(map(len, alike), default=0), _FOLDS)
     return [
-        tuple(name for batch in alike for name in batch[number::count]) for number in range(count)
+        tuple(chain.from_iterable(batch[number::count] for batch in alike))
+        for number in range(count)
     ]
 
 

@@ -252,8 +252,10 @@ def summarise_folds(folds: Sequence[Mapping[str, ErrorSummary]]) -> dict[str, Er
 
     The models are those of all folds: a law is used in some folds alone.
     """
-    shared = [model for model in folds[0] if all(model in fold for fold in folds)]
-    return {model: _over_folds([fold[model] for fold in folds]) for model in shared}
+    shared = set(folds[0]).intersection(*folds)
+    return {
+        model: _over_folds([fold[model] for fold in folds]) for model in folds[0] if model in shared
+    }
 
 
 def published_errors(name: str) -> Mapping[str, PublishedError]:

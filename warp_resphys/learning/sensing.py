@@ -88,7 +88,8 @@ def at_steps(
     from scipy.interpolate import CubicSpline
 
     since = trials.times if delay is None else (trials.times - delay[:, None]).clamp_min(0.0)
-    times, markers, held = (t.cpu().numpy() for t in (since, trials.observed, trials.held))
+    times = since.cpu().numpy()
+    markers, held = trials.observed.cpu().numpy(), trials.held.cpu().numpy()
     steps = step * np.arange(int(times.max() / step + 1e-6) + 1)
     positions = np.full((len(times), len(steps), *markers.shape[2:]), np.nan)
     for r, m in np.ndindex(len(times), markers.shape[2]):

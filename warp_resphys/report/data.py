@@ -174,11 +174,12 @@ class TrialResults:
 
     def of_tip(self, tip: IntArray) -> "TrialResults":
         """Returns the same trials with the mean of some vertices (P,) as the only marker."""
-        target, bound, *simulated = (
-            q[..., tip, :].mean(-2, keepdims=True)
-            for q in (self.target, self.bound, *self.positions.values())
-        )
-        positions = dict(zip(self.positions, simulated, strict=True))
+
+        def mean(q: FloatArray) -> FloatArray:
+            return np.asarray(q[..., tip, :].mean(-2, keepdims=True))
+
+        positions = {model: mean(q) for model, q in self.positions.items()}
+        target, bound = mean(self.target), mean(self.bound)
         return replace(self, labels=("tip",), target=target, bound=bound, positions=positions)
 
 

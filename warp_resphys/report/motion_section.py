@@ -194,7 +194,8 @@ def _instants_figure(
     if data.metrics["errors_mm"][last]["diverged"]:
         caption += f" Where {MODELS[last].name} is not drawn, it has diverged."
     alt = f"The deformed body at {when}, with observed and simulated markers."
-    count, height, width, _ = frames.shape
+    count = len(frames)
+    height, width = frames.shape[1:3]
     figure = figures.new_figure(4.0 * height / width * figures.WIDE / count + 0.35)
     panels = figure.subplots(2, count, squeeze=False)
     for row, frame, title in zip(panels.T, frames, titles, strict=True):
@@ -318,7 +319,7 @@ def reduced(
         Vectors of unit length, or one of zeros for bodies at rest, and weights [m], NaN in frames
         that are left out.
     """
-    count, frames, *_ = displacements.shape
+    count, frames = displacements.shape[:2]
     rows = displacements.reshape(count * frames, -1)
     finite = np.isfinite(rows).all(axis=1)
     remaining = rows[finite].copy()

@@ -185,7 +185,8 @@ def trials_section(data: RunReport, canvas: Canvas) -> Part | None:
     )
     fits = [fold["free_fits"] for fold in folds if "free_fits" in fold]
     merged = {
-        model: [row for by_model in fits for row in by_model.get(model, ())] for model in _CHAIN
+        model: [*chain.from_iterable(by_model.get(model, ()) for by_model in fits)]
+        for model in _CHAIN
     }
     tables += rest_table(merged, data.driven)
     return Part("Trial by trial", tables) if tables else None

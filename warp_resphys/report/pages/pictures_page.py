@@ -373,9 +373,9 @@ def _seen_from_the_side(group: h5py.Group, up: FloatArray) -> list[tuple[FloatAr
     axes = np.stack([np.linalg.eigh(level @ np.cov(shape.T) @ level)[1][:, -1], up], 1)
     seen = list[tuple[FloatArray, ...]]()
     for model in _MODELS:
-        places, distances, surface = (
-            read_array(group, f"{model}_{key}") for key in ("places", "distances", "surface")
-        )
+        places = read_array(group, f"{model}_places")
+        distances = read_array(group, f"{model}_distances")
+        surface = read_array(group, f"{model}_surface")
         seen.append((places @ axes, 1e3 * distances, surface[triangles] @ axes))
     return seen
 

@@ -91,8 +91,7 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
         ConvergenceError, WorkerError: a step of the simulation fails.
     """
     settings: StageSettings = context.settings
-    laboratory = settings.laboratory
-    trials = settings.trials
+    laboratory, trials = settings.laboratory, settings.trials
     cut_up = list[TrialPart]()
     for begins in dict.fromkeys(trial.begins for trial in trials):
         names = [trial.name for trial in trials if trial.begins == begins]
@@ -120,8 +119,7 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
     noise = [_record(context, setup, trial, *seen[trial.name]) for trial in trials]
     if all(trial.scale == 1.0 for trial in trials):
         material = laboratory.material
-        fibres = laboratory.fibres
-        muscles = laboratory.muscles
+        fibres, muscles = laboratory.fibres, laboratory.muscles
         wound = {} if fibres is None else {"fibre_stiffness": fibres.stiffness}
         wound |= {} if muscles is None else {"muscle_stiffness": muscles.stiffness}
         released = {trial.name: _drawn(settings, trial)[1] for trial in trials}
@@ -301,8 +299,7 @@ def check_laboratory(run: RunSettings, trials: Sequence[Trial]) -> None:
     Raises:
         InputError: durations, inputs or time steps that do not fit the trials or the body.
     """
-    data = run.recorded
-    laboratory = run.laboratory
+    data, laboratory = run.recorded, run.laboratory
     begins = {trial.begins for trial in trials}
     assert data is not None
     assert laboratory is not None

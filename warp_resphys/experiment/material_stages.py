@@ -279,8 +279,7 @@ def identify_material(context: StageContext) -> None:
         ConvergenceError: a specimen has no equilibrium.
     """
     settings: StageSettings = context.settings
-    data = settings.data
-    wanted = settings.law
+    data, wanted = settings.data, settings.law
     material = settings.simulation.values
     ratio, density = material["poissons_ratio"], material["density"]
     tests, held, notes = tests_of(data, ratio, settings.seed)

@@ -149,8 +149,7 @@ class RunReader:
 
     def report(self) -> RunReport:
         """Returns all data of the page."""
-        run = self.run
-        body = self.body
+        run, body = self.run, self.body
         trials = self.trials
         identification = Identification.read(self.folder / IDENTIFICATION)
         metrics = shown_metrics(collect_metrics(self.folder, run))
@@ -294,8 +293,7 @@ class RunReader:
     @cached_property
     def driven(self) -> Driven | None:
         """Driving inputs of all trials; None without actuators."""
-        trials = self.dataset
-        scaled = self.scaled
+        trials, scaled = self.dataset, self.scaled
         quantity = driving_quantity(self.run)
         if quantity is None or quantity.name not in trials.inputs:
             return None
@@ -341,8 +339,7 @@ class RunReader:
             the law. ``outside``: the share of cells and states of the test trials outside of the
             training; None if it is not known.
         """
-        trials = self.trials
-        film = self.film
+        trials, film = self.trials, self.film
         learned = law.get("stretches")
         trained = (
             {} if learned is None else {"the training": (float(learned[0]), float(learned[1]))}
@@ -401,8 +398,7 @@ class RunReader:
         inputs; otherwise the body is undeformed.
         """
         mesh = self.body.mesh
-        trials = self.trials
-        film = self.film
+        trials, film = self.trials, self.film
         model = "simulation"
         if film is None or model not in film.positions or film.trial not in trials.names:
             return mesh, {}

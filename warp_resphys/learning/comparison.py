@@ -396,8 +396,7 @@ class Comparison:
         below it. The intervals of a robot, which does not know the variance due to the parameters,
         are `without_spread`.
         """
-        motions = self.motions
-        trials = self.motions.trials
+        motions, trials = self.motions, self.motions.trials
         test = self.groups["1"]
         rest = rest_places(trials)
         target = counted(motions, self.train, test, self._first_frames)

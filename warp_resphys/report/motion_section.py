@@ -213,8 +213,7 @@ def view_in_space(
 
     With a target, vertices are compared with it; without one, markers are compared.
     """
-    mesh = motion.mesh
-    obstacles = motion.obstacles
+    mesh, obstacles = motion.mesh, motion.obstacles
     surface = surface_vertices(motion.mesh)
     rest, faces = mesh.vertices[surface], np.searchsorted(surface, boundary_triangles(mesh))
     size = float(np.ptp(mesh.vertices, axis=0).max())

@@ -367,7 +367,6 @@ def _series(
     """
     trials = recorded.trials
     cutoff = recorded.data.cutoff
-    step = recorded.settings.time_step
     lengths = [
         len(moving.positions) if t.is_released else 1
         for t, moving in zip(trials, recorded.moving, strict=True)
@@ -389,7 +388,7 @@ def _series(
         if trial.is_released:
             times[row] = np.pad(moving.time, (0, frames - len(seen)), mode="edge")
         elif trial.begins in RESTING:
-            times[row] = np.minimum(np.arange(frames), steps or 0) * step
+            times[row] = np.minimum(np.arange(frames), steps or 0) * recorded.settings.time_step
             held[row] = np.where(np.isfinite(observed[row, 0]), observed[row, 0], held[row])
         else:
             # The displacement of a static pose counts from the undeformed body.

@@ -117,8 +117,7 @@ class Reader:
         """Refuses trials without markers, durations,
         limits of their inputs, or a place for their payload.
         """
-        data = self.data
-        drive = self.drive
+        data, drive = self.data, self.drive
         begins = {trial.begins for trial in self.trials}
         for trial in self.trials:
             if not self.tracked_in(trial):

@@ -248,8 +248,7 @@ class LearnedPredictor:
         """Returns the model's force (B, N, 3) [N] or next state,
         on the simulator's device and in its precision.
         """
-        q = state.q
-        v = state.v
+        q, v = state.q, state.v
         like = self.model.rest
         if self._base is not None:
             q, v = self._base.enter(q, v, step)

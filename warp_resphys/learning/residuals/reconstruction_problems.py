@@ -155,8 +155,7 @@ class FullStateProblem(StepProblem):
 
     @override
     def linearise(self, point: Point) -> Move:
-        step = self._step
-        weight = self._weight
+        step, weight = self._step, self._weight
         x = point.x
         (force,) = point.kept
         short = _SHORT * self.tolerance

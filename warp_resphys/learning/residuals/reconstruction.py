@@ -399,8 +399,8 @@ def reconstruct(
             work = partial(_reconstructed, used, motions, batch, known, wanted, acts)
             cut_up.append(TrialPart(f"part{number}_{first:03d}", batch, frames, work))
     parts.run(cut_up)
-    names = chain.from_iterable(part.names for part in cut_up)
-    return ReconstructedTrials(tuple(names), partial(parts.joined, cut_up))
+    order = chain.from_iterable(part.names for part in cut_up)
+    return ReconstructedTrials(tuple(order), partial(parts.joined, cut_up))
 
 
 def _reconstructed(

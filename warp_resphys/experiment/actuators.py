@@ -32,9 +32,9 @@ _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {
     "tendons": {"tension": TENSION, "contraction": CONTRACTION},
     "muscles": {"stress": STRESS, "contraction": MUSCLE_CONTRACTION},
 }
+_QUANTITIES: Final = (PRESSURE, *_COMMANDED["tendons"].values(), *_COMMANDED["muscles"].values())
 DRIVING_QUANTITIES: Final[Mapping[str, Quantity]] = {
-    quantity.name: quantity
-    for quantity in (PRESSURE, *(q for group in _COMMANDED.values() for q in group.values()))
+    quantity.name: quantity for quantity in _QUANTITIES
 }
 
 
@@ -102,7 +102,8 @@ def build_chambers(settings: BodySettings, mesh: Mesh) -> tuple[Chamber, ...]:
             of them.
         MeshError: no face lies at a place, or the mesh has no such surface.
     """
-    if (group := settings.chambers) is None:
+    group = settings.chambers
+    if group is None:
         return ()
     closed = find_chambers(mesh, group.axis)
     if len(closed) != group.count:
@@ -111,7 +112,8 @@ def build_chambers(settings: BodySettings, mesh: Mesh) -> tuple[Chamber, ...]:
             "open chambers do not count, so close them in the mesh, name them in "
             "chambers.faces, or change chambers.count."
         )
-    if twice := group.faces.keys() & {chamber.name for chamber in closed}:
+    twice = group.faces.keys() & {chamber.name for chamber in closed}
+    if twice:
         raise InputError(
             f"chambers.faces.{min(twice)}: a closed chamber has this name: choose another."
         )
@@ -179,9 +181,8 @@ def _driving(settings: BodySettings) -> tuple[Quantity, int] | None:
         if energy.inputs:
             driving[f"energies.{name}"] = energy.inputs[0], energy.count
     if len(driving) > 1:
-        first, second, *_ = driving
         raise InputError(
-            f"{first} and {second} are two inputs of the body, "
+            f"{' and '.join([*driving][:2])} are two inputs of the body, "
             "but recordings have one: take one out."
         )
     return next(iter(driving.values()), None)

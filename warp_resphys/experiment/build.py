@@ -91,7 +91,8 @@ def shipped_arm(name: str) -> Mesh:
     Raises:
         InputError: the name is unknown.
     """
-    if name not in (names := _shipped_arms()):
+    names = _shipped_arms()
+    if name not in names:
         raise InputError(
             f"mesh.name is {name!r}: the arms that come with the package are {', '.join(names)}."
         )
@@ -143,7 +144,8 @@ def _built_mesh(settings: MeshSettings, file: str | None) -> Mesh:
 def _check_memory(divisions: Sequence[int]) -> None:
     """Refuses a box whose cells do not fit into the free memory."""
     cells, limit = math.prod(divisions), _SHARE_OF_MEMORY * available_memory_gib()
-    if (needed := cells * _BYTES_PER_CELL / 2**30) > limit:
+    needed = cells * _BYTES_PER_CELL / 2**30
+    if needed > limit:
         raise InputError(
             f"mesh.divisions gives {cells:,} cells, which take at least {needed:.3g} GiB, but "
             f"{limit:.3g} GiB are free: use fewer."
@@ -204,9 +206,7 @@ def build_body(settings: BodySettings, mesh: Mesh | None = None) -> Body:
     """
     if mesh is not None:
         return _body(settings, mesh)
-    files = tuple(
-        _file_of(mesh) for mesh in (settings.mesh, *(part.mesh for part in settings.parts.values()))
-    )
+    files = tuple(_file_of(mesh) for mesh in settings.meshes)
     return _built_body(BodySettings.of(settings), files)
 
 
@@ -257,7 +257,8 @@ def whole_mesh(settings: BodySettings) -> Mesh:
             part_mesh = build_mesh(part.mesh)
         parts[name] = replace(part_mesh, vertices=part_mesh.vertices + np.asarray(part.shift))
     joined = join({"body": mesh, **parts})
-    if twice := joined.regions.keys() & mesh.regions.keys():
+    twice = joined.regions.keys() & mesh.regions.keys()
+    if twice:
         raise MeshError(
             f"a part and a region of the first mesh have the name {min(twice)!r}: rename the part."
         )
@@ -304,7 +305,8 @@ def bound_markers(
             follow_vertices(mesh, mounted_on(settings.rigid_bodies[body], mesh), points[corners])
         )
         rows.append(list(range(corners.start, corners.stop)))
-    if marked := [row for row, label in enumerate(labels) if label in settings.tracked]:
+    marked = [row for row, label in enumerate(labels) if label in settings.tracked]
+    if marked:
         tracked = mesh, points[marked], [labels[row] for row in marked]
         if settings.observation is not None:
             markers = settings.observation.factory(

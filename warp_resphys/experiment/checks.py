@@ -136,14 +136,10 @@ def _check_target(run: RunSettings, body: Body, drive: Drive | None) -> None:
         with naming(f"{key}.mesh: "):
             vertices_in(simulator.body.mesh, body.mesh)
         if isinstance(run.data, ReleaseFromLoad):
-            others = run.data.others.items()
-            places = {
-                f"data.others.{name}.at": one.at
-                for name, loads in others
-                for one in loads
-                if one.at
-            }
-            for place, at in {"data.load": run.data.load, **places}.items():
+            places = {"data.load": run.data.load}
+            for name, loads in run.data.others.items():
+                places |= {f"data.others.{name}.at": one.at for one in loads if one.at}
+            for place, at in places.items():
                 with naming(f"{place}: "):
                     vertices_at(simulator.body.mesh, at)
 
@@ -190,7 +186,8 @@ def _check_learning(run: RunSettings, simulator: Simulator, trials: Sequence[Tri
 
 def _check_begins(run: RunSettings, data: RecordedData, begins: set[str]) -> None:
     """Checks what is estimated of releases, and that driven trials are as long as the horizons."""
-    if begins & {"held", "released"} and (sideways := run.release.sideways):
+    sideways = run.release.sideways
+    if sideways and begins & {"held", "released"}:
         if data.rest != "held":
             raise InputError(
                 f"release.sideways is {sideways:g} m, but data.rest is {data.rest}, which gives "

@@ -1,5 +1,6 @@
 """Digests of the files that a configuration names, which fingerprints of stages contain."""
 
+from itertools import chain
 from pathlib import Path
 
 from ..io.atomic import digest
@@ -24,12 +25,7 @@ def files_read(run: RunSettings, *bodies: BodySettings | None) -> dict[str, str]
         name: digest_of(folder / name, "the file of base_motion or obstacle_motion")
         for name in sorted(moved)
     }
-    meshes = [
-        mesh
-        for body in bodies
-        if body
-        for mesh in (body.mesh, *(part.mesh for part in body.parts.values()))
-    ]
+    meshes = chain.from_iterable(body.meshes for body in bodies if body)
     paths = [getattr(mesh, "path", None) for mesh in meshes]
     return motions | {path: digest(path) for path in paths if path is not None}
 

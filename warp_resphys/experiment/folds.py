@@ -120,7 +120,9 @@ def intervals_of_folds(folder: Path, folders: Mapping[str, Path]) -> IntervalTab
         folder: of the dataset.
         folders: folders of the folds, by the trial that a fold leaves out.
     """
-    data, names, models = Trials.read(folder / DATASET), list(folders), dict[str, ModelIntervals]()
+    data = Trials.read(folder / DATASET)
+    names = list(folders)
+    models = dict[str, ModelIntervals]()
     for model in (
         (*BASELINES, *INTERVAL_MODELS) if data.bound is not None and len(names) > 2 else ()
     ):
@@ -133,8 +135,7 @@ def intervals_of_folds(folder: Path, folders: Mapping[str, Path]) -> IntervalTab
                     )
         if len(series["observed"]) == len(names):
             spreads = series["spread"] if len(series["spread"]) == len(names) else None
-            if (
-                covered := intervals_of_each_other(data, names, series["observed"], spreads)
-            ) is not None:
+            covered = intervals_of_each_other(data, names, series["observed"], spreads)
+            if covered is not None:
                 models[model] = covered
     return {"level": LEVEL, "calibrated_on": "folds", "models": models}

@@ -45,7 +45,9 @@ def force_curves(
         ranges = ranges.max(axis=1) - ranges.min(axis=1)
         same = [UNITS[axis] == sensor.unit for axis in AXES]
         row, axis = divmod(int(np.argmax(np.where(same, ranges, -1.0))), len(AXES))
-        times, read, off = trials.times[rows[row]], measured[row, :, axis], np.zeros(())
+        times = trials.times[rows[row]]
+        read = measured[row, :, axis]
+        off = np.zeros(())
         if known and (sensor.zero or sensor.drift):
             last = torch.from_numpy(known[next(reversed(known))][row])
             pair = torch.from_numpy(measured[row])[None], torch.from_numpy(times)[None]

@@ -91,7 +91,8 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
         ConvergenceError, WorkerError: a step of the simulation fails.
     """
     settings: StageSettings = context.settings
-    laboratory, trials, cut_up = settings.laboratory, settings.trials, list[TrialPart]()
+    laboratory, trials = settings.laboratory, settings.trials
+    cut_up = list[TrialPart]()
     for begins in dict.fromkeys(trial.begins for trial in trials):
         names = [trial.name for trial in trials if trial.begins == begins]
         if begins == STATIC:
@@ -111,18 +112,14 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
     parts = context.parts(workers)
     parts.run(cut_up)
     setup = make_setup(settings)
-    seen = {
-        name: row
-        for part in cut_up
-        for name, *row in zip(
-            part.names, *(parts.read(part, key) for key in ("markers", "loads")), strict=True
-        )
-    }
+    seen = dict[str, tuple[FloatArray, FloatArray]]()
+    for part in cut_up:
+        markers, loads = parts.read(part, "markers"), parts.read(part, "loads")
+        seen |= dict(zip(part.names, zip(markers, loads, strict=True), strict=True))
     noise = [_record(context, setup, trial, *seen[trial.name]) for trial in trials]
     if all(trial.scale == 1.0 for trial in trials):
-        material, fibres, muscles = (
-            getattr(laboratory, key) for key in ("material", "fibres", "muscles")
-        )
+        material = laboratory.material
+        fibres, muscles = laboratory.fibres, laboratory.muscles
         wound = {} if fibres is None else {"fibre_stiffness": fibres.stiffness}
         wound |= {} if muscles is None else {"muscle_stiffness": muscles.stiffness}
         released = {trial.name: _drawn(settings, trial)[1] for trial in trials}
@@ -302,7 +299,8 @@ def check_laboratory(run: RunSettings, trials: Sequence[Trial]) -> None:
     Raises:
         InputError: durations, inputs or time steps that do not fit the trials or the body.
     """
-    data, laboratory, begins = run.recorded, run.laboratory, {trial.begins for trial in trials}
+    data, laboratory = run.recorded, run.laboratory
+    begins = {trial.begins for trial in trials}
     assert data is not None
     assert laboratory is not None
     for trial in trials:

@@ -4,6 +4,7 @@ import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,8 @@ _REACH = 2.0
 
 def material_stages(run: RunSettings, data: MaterialTestData) -> list[Stage]:
     """Returns the stages of a run with some tests."""
-    files = {str(path): digest(path) for paths in table_files(data).values() for path in paths}
+    paths = chain.from_iterable(table_files(data).values())
+    files = {str(path): digest(path) for path in paths}
     if run.law is not None and run.law.file is not None:
         files[run.law.file] = digest(law_path(run.law.file))
     settings = StageSettings.reading(run, "simulation", "law", "data", "seed", "name", files=files)
@@ -137,7 +139,9 @@ def tests_of(
         InputError: samples that are no test, or none in the range.
         ConvergenceError: a simulated specimen has no equilibrium.
     """
-    fitted, held, tables = dict[str, MaterialTest](), dict[str, MaterialTest](), table_files(data)
+    fitted = dict[str, MaterialTest]()
+    held = dict[str, MaterialTest]()
+    tables = table_files(data)
     names, notes = names_of(data, tables), list[str]()
     for number, (name, wanted) in enumerate(data.tests.items()):
         found = held if wanted.held_out else fitted
@@ -153,7 +157,8 @@ def tests_of(
                         path, called, data, wanted, poissons_ratio, random
                     )
             notes += [f"{called}: {note}" for note in said]
-    notes += [f"{name}: {note}" for name, test in (fitted | held).items() for note in test.left_out]
+    for name, test in (fitted | held).items():
+        notes += [f"{name}: {note}" for note in test.left_out]
     return fitted, held, notes
 
 
@@ -175,7 +180,11 @@ def _inflated(
                 "give heights that were measured."
             )
         membrane = Membrane(
-            *(wanted.radius, table.thickness, table.cap, force, table.rings),
+            radius=wanted.radius,
+            thickness=table.thickness,
+            cap=table.cap,
+            force=force,
+            rings=table.rings,
             ring_modulus=wanted.ring_modulus,
             poissons_ratio=poissons_ratio,
         )
@@ -207,19 +216,24 @@ def _deformed(
     size = wanted.specimen
     assert size is not None
     specimen = Specimen(size.length, size.section, poissons_ratio, size.indenter, size.cells)
-    simulated, lines, notes = specimen if size.is_simulated else None, None, list[str]()
+    simulated = specimen if size.is_simulated else None
+    lines = None
+    notes = list[str]()
     if path is not None:
         strain, stress, table = _recorded(path, data, specimen)
-        seconds, lines, notes = table.columns.get("time"), table.lines, [*table.notes]
+        seconds = table.columns.get("time")
+        lines = table.lines
+        notes = [*table.notes]
     else:
         assert data.simulated is not None
-        (strain, stress), seconds = (
-            _played(wanted.kind, specimen, simulated, data.simulated, random),
-            None,
-        )
+        strain, stress = _played(wanted.kind, specimen, simulated, data.simulated, random)
+        seconds = None
     counted = _counted(strain, data, name)
     test = MaterialTest(
-        *(wanted.kind, strain, stress, seconds),
+        kind=wanted.kind,
+        strain=strain,
+        stress=stress,
+        seconds=seconds,
         toe=wanted.toe,
         compliance=wanted.compliance * specimen.area / size.length,
         specimen=simulated,
@@ -265,7 +279,8 @@ def identify_material(context: StageContext) -> None:
         ConvergenceError: a specimen has no equilibrium.
     """
     settings: StageSettings = context.settings
-    data, wanted, material = settings.data, settings.law, settings.simulation.values
+    data, wanted = settings.data, settings.law
+    material = settings.simulation.values
     ratio, density = material["poissons_ratio"], material["density"]
     tests, held, notes = tests_of(data, ratio, settings.seed)
     known = None if wanted.file is None else read_law(wanted.file)

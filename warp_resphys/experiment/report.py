@@ -125,7 +125,9 @@ class RunReader:
     """
 
     def __init__(self, folder: Path, run: RunSettings) -> None:
-        self.folder, self.run, self.common = folder, run, common_folder(folder)
+        self.folder = folder
+        self.run = run
+        self.common = common_folder(folder)
         # Equal to the simulator below it.
         self._hidden = ("resphys",) if run.reconstruction is None else ()
 
@@ -142,18 +144,20 @@ class RunReader:
     @cached_property
     def scaled(self) -> Trials | None:
         """Trials with scaled inputs, if there are any."""
-        return Trials.read(path) if (path := self.common / SCALED_DATASET).is_file() else None
+        path = self.common / SCALED_DATASET
+        return Trials.read(path) if path.is_file() else None
 
     def report(self) -> RunReport:
         """Returns all data of the page."""
-        run, body, trials = self.run, self.body, self.trials
+        run, body = self.run, self.body
+        trials = self.trials
         identification = Identification.read(self.folder / IDENTIFICATION)
         metrics = shown_metrics(collect_metrics(self.folder, run))
         material = read_if_there(self.common / TRUTH).get("material", {})
         # (K + 1, R, O) inputs, by name
         moved = self.dataset.contact_at(trials.names, body, self.dataset.time_step)
         assert run.tip is not None
-        names = {name for result in identification.values() for name in result.parameters}
+        names = set[str]().union(*(result.parameters for result in identification.values()))
         histories = (
             (m, read_if_there(path).get("epochs"))
             for m, path in training_files(self.folder, run).items()
@@ -289,7 +293,8 @@ class RunReader:
     @cached_property
     def driven(self) -> Driven | None:
         """Driving inputs of all trials; None without actuators."""
-        trials, scaled, quantity = self.dataset, self.scaled, driving_quantity(self.run)
+        trials, scaled = self.dataset, self.scaled
+        quantity = driving_quantity(self.run)
         if quantity is None or quantity.name not in trials.inputs:
             return None
         values: dict[str, FloatArray] = {}
@@ -334,7 +339,8 @@ class RunReader:
             the law. ``outside``: the share of cells and states of the test trials outside of the
             training; None if it is not known.
         """
-        trials, film, learned = self.trials, self.film, law.get("stretches")
+        trials, film = self.trials, self.film
+        learned = law.get("stretches")
         trained = (
             {} if learned is None else {"the training": (float(learned[0]), float(learned[1]))}
         )
@@ -377,7 +383,8 @@ class RunReader:
         """Chambers under pressure, in the order of the pressures."""
         by_name = {chamber.name: chamber for chamber in build_chambers(self.run, self.body.mesh)}
         names = () if self.driven is None or not by_name else self.driven.channels
-        if unknown := [name for name in names if name not in by_name]:
+        unknown = [name for name in names if name not in by_name]
+        if unknown:
             raise DataFileError(
                 f"{DATASET} has pressures of {', '.join(unknown)}, but the body's chambers are "
                 f"{', '.join(by_name)}: use the mesh with which the trials were imported."
@@ -390,7 +397,9 @@ class RunReader:
         If trials begin at rest, this is the equilibrium of the uncorrected simulator without
         inputs; otherwise the body is undeformed.
         """
-        mesh, trials, film, model = self.body.mesh, self.trials, self.film, "simulation"
+        mesh = self.body.mesh
+        trials, film = self.trials, self.film
+        model = "simulation"
         if film is None or model not in film.positions or film.trial not in trials.names:
             return mesh, {}
         row = trials.names.index(film.trial)

@@ -82,13 +82,15 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
         metrics["control"] = control
     if run.shapes and (shapes := read_if_there(folder / SHAPES)):
         metrics["shapes"] = shapes
-    if registered := read_if_there(common / REGISTRATION):
+    registered = read_if_there(common / REGISTRATION)
+    if registered:
         metrics["placement"] = placement(registered, identified)
     if run.mesh_check is not None and (check := read_if_there(folder / MESH_CHECK)):
         metrics["mesh_check"] = check
     if run.timing and (times := read_if_there(folder / TIMES)):
         metrics["seconds_per_test_trajectory"] = times["seconds"]
-    if "noise_mm" in (truth := read_if_there(common / TRUTH)):
+    truth = read_if_there(common / TRUTH)
+    if "noise_mm" in truth:
         metrics["noise_mm"] = truth["noise_mm"]
     metrics["recommended"] = recommended(metrics, run)
     return metrics

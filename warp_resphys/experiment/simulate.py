@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from itertools import islice, repeat
+from itertools import chain, islice, repeat
 from typing import Any, Final
 
 import numpy as np
@@ -198,11 +198,9 @@ def true_motions(
     pushed = [
         prescribed_all(data.obstacle_motion, trial.obstacle_motion, times) for trial in trials
     ]
-    obstacles = {
-        name: np.stack([poses.get(name, still) for poses in pushed])
-        for poses in pushed
-        for name in poses
-    }
+    obstacles = {}
+    for name in dict.fromkeys(chain.from_iterable(pushed)):
+        obstacles[name] = np.stack([poses.get(name, still) for poses in pushed])
     return np.stack(base) if any(motions) else None, obstacles
 
 

@@ -2,7 +2,7 @@
 and their split into training, validation and test.
 """
 
-from itertools import islice
+from itertools import chain, islice, product
 from pathlib import Path
 from typing import Any, Final
 
@@ -49,9 +49,10 @@ def all_trials(run: RunSettings) -> dict[str, Trial]:
     trials = _recorded(data) if data.folder is not None else _played(run, data)
     if run.markers is not None:
         tracked = run.markers.observed
-        if nowhere := [
+        nowhere = [
             label for label in tracked if not any(trial.has(label) for trial in trials.values())
-        ]:
+        ]
+        if nowhere:
             raise InputError(
                 f"{listed(owners(nowhere))} of markers.tracked or rigid_bodies is in no "
                 "data.trials.NAME.labels: add it there, or leave it out."
@@ -67,13 +68,16 @@ def _trial(data: RecordedData, name: str, settings: TrialSettings, **more: Any) 
 def _recorded(data: RecordedData) -> dict[str, Trial]:
     """Trials with a recording in a folder."""
     assert data.folder is not None
-    folder, trials, files = Path(data.folder).expanduser(), dict[str, Trial](), dict[str, str]()
+    folder = Path(data.folder).expanduser()
+    trials = dict[str, Trial]()
+    files = dict[str, str]()
     for name, settings in (data.trials or _recordings(folder)).items():
         if settings.file is None:
             raise InputError(
                 f"data.trials.{name}.file is missing: give the name of a file in data.folder."
             )
-        if (other := files.setdefault(settings.file, name)) != name:
+        other = files.setdefault(settings.file, name)
+        if other != name:
             raise InputError(
                 f"the trials '{other}' and '{name}' have the same file, "
                 f"{settings.file}: use it once."
@@ -106,7 +110,8 @@ def _recordings(folder: Path) -> dict[str, TrialSettings]:
         raise DataFileError(f"{folder} is not a folder: set data.folder to your recordings.")
     files: dict[str, str] = {}
     for path in sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES):
-        if (other := files.setdefault(path.stem, path.name)) != path.name:
+        other = files.setdefault(path.stem, path.name)
+        if other != path.name:
             raise DataFileError(
                 f"{folder} has two recordings of one name, {other} and {path.name}: list the "
                 "trials in data.trials."
@@ -150,15 +155,18 @@ def _valued(data: SimulatedData) -> dict[str, list[str]]:
     """Names of the trials in each split of a simulated experiment, from the configured values."""
     key, unit, _ = _VARIATIONS[data.kind]
     named = {name: [f"{value:g}{unit}" for value in getattr(data.amounts, name)] for name in SPLITS}
-    if empty := [name for name, row in named.items() if not row]:
+    empty = [name for name, row in named.items() if not row]
+    if empty:
         raise InputError(
             f"data.{key}.{empty[0]} is empty: give the split at least one value, in {unit.strip()}."
         )
-    names = [name for row in named.values() for name in row]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
+    names = [*chain.from_iterable(named.values())]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
         raise InputError(f"data.{key} names {twice[0]} twice: a trial belongs to one split only.")
     if isinstance(data, ReleaseFromLoad):
-        if double := [name for name in data.others if name in names]:
+        double = [name for name in data.others if name in names]
+        if double:
             raise InputError(
                 f"data.others names '{double[0]}', which is a trial of data.{key}: rename it."
             )
@@ -188,13 +196,10 @@ def _named(run: RunSettings) -> dict[str, list[str]]:
             f"there are {len(names)}."
         )
     rest, lists = iter(names), dict[str, list[str]]()
-    if open_ends := [name for name, members in wanted.items() if members == OTHERS]:
-        taken = [
-            member
-            for members in wanted.values()
-            if not isinstance(members, int | str)
-            for member in members
-        ]
+    open_ends = [name for name, members in wanted.items() if members == OTHERS]
+    if open_ends:
+        given = [members for members in wanted.values() if not isinstance(members, int | str)]
+        taken = [*chain.from_iterable(given)]
         if len(open_ends) > 1 or asked:
             raise InputError(
                 f"{group}.{open_ends[0]} is others, the trials that the other two do not name: "
@@ -213,7 +218,8 @@ def _named(run: RunSettings) -> dict[str, list[str]]:
             more = ", or set data.folds to leave_one_out" if group == "data" else ""
             raise InputError(f"{group}.{name} is empty: add at least one of {table}.trials{more}.")
     seen: dict[str, str] = {}
-    for name, trial in ((name, trial) for name, members in lists.items() for trial in members):
+    of_splits = [(name, trial) for name, members in lists.items() for trial in members]
+    for name, trial in of_splits:
         # The remainder of a partly trained trial is tested.
         if trial in seen and not (
             run.train_fraction < 1.0 and (seen[trial], name) == ("train", "test")
@@ -279,8 +285,7 @@ def scaled_trials_of(run: RunSettings) -> tuple[Trial, ...]:
     test = [trials[name] for name in split_of(run).test]
     return tuple(
         trial.model_copy(update={"name": scaled_name(trial.name, scale), "scale": scale})
-        for scale in run.input_scales
-        for trial in test
+        for scale, trial in product(run.input_scales, test)
     )
 
 

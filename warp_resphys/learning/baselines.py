@@ -68,7 +68,8 @@ def linear(trials: PlainTrials, asked: PlainTrials) -> Prediction:
     some trials do not show follow from the components.
     """
     seen = np.asarray(np.isfinite(trials.moved).any(1))  # (R, P)
-    if not (common := seen.all(0)).any():
+    common = seen.all(0)
+    if not common.any():
         # The trials that show the coordinate that most of them and the others show.
         wanted = seen.sum(0) * (1.0 + len(seen) * np.isfinite(asked.first).any(0))
         return linear(trials.select(seen[:, wanted.argmax()]), asked)

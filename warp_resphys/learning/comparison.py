@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import chain
+from itertools import chain, product
 from typing import Any, Final
 
 import numpy as np
@@ -90,7 +90,7 @@ class Comparison:
     @property
     def names(self) -> list[str]:
         """Names of all tested trials."""
-        return [name for group in self.groups.values() for name in group]
+        return [*chain.from_iterable(self.groups.values())]
 
     @cached_property
     def _largest(self) -> list[str]:
@@ -239,7 +239,7 @@ class Comparison:
     def _in_order(self, model: str, name: str) -> Any:
         """An array of the roll-outs of a model, (R, ...) in the order of the tested trials."""
         parts = self._rolled_out[0][model]
-        order = [trial for part in parts for trial in part.names]
+        order = [*chain.from_iterable(part.names for part in parts)]
         rows = [order.index(trial) for trial in self.names]
         if name in ("observed", "loads"):
             return self.parts.joined(parts, name, self.motions.trials.observed.shape[1])[rows]
@@ -250,11 +250,8 @@ class Comparison:
         """First frames of trials from which values of some model were estimated, see
         `Identified`.
         """
-        return {
-            o: shown
-            for model in self.models.values()
-            for o, shown in model.identified.first_frames.items()
-        }
+        shown = [model.identified.first_frames for model in self.models.values()]
+        return dict(chain.from_iterable(frames.items() for frames in shown))
 
     @cached_property
     def _without_physics(self) -> tuple[dict[str, FloatArray], dict[str, str], dict[str, str]]:
@@ -369,9 +366,11 @@ class Comparison:
         sideways = dict(
             zip(self.names, self._in_order([*self.models][-1], "sideways").tolist(), strict=True)
         )
-        if known := {name: sideways[name] for name in test if math.isfinite(sideways[name])}:
+        known = {name: sideways[name] for name in test if math.isfinite(sideways[name])}
+        if known:
             content["sideways_mm"] = known
-        if any((fits := self._free_fits()).values()):
+        fits = self._free_fits()
+        if any(fits.values()):
             content["free_fits"] = fits
         if self.calibration and (intervals := self._intervals())["models"]:
             content["intervals"] = intervals
@@ -397,7 +396,8 @@ class Comparison:
         below it. The intervals of a robot, which does not know the variance due to the parameters,
         are `without_spread`.
         """
-        motions, trials, test = self.motions, self.motions.trials, self.groups["1"]
+        motions, trials = self.motions, self.motions.trials
+        test = self.groups["1"]
         rest = rest_places(trials)
         target = counted(motions, self.train, test, self._first_frames)
         names = [*dict.fromkeys(chain(self.calibration, *map(self._calibrating, self._growing)))]
@@ -433,7 +433,8 @@ class Comparison:
             alone[model] = self._calibrated(model, known) if model in self.spreads else None
         models = dict[str, ModelIntervals]()
         for model in (model for model in simulated if model in self.simulated):
-            if (intervals := self._grown(model, whole)) is None:
+            intervals = self._grown(model, whole)
+            if intervals is None:
                 continue
             new = self.simulated[model][: len(test)]
             tested = predicted_trials(trials, test, new, target, self.spreads.get(model))
@@ -441,7 +442,8 @@ class Comparison:
                 {name: intervals.covered(trial, rest) for name, trial in tested.items()}
             )
             models[model] = {**intervals.plain(), **covered}
-            if (of_robot := self._grown(model, alone)) is not None:
+            of_robot = self._grown(model, alone)
+            if of_robot is not None:
                 models[model]["without_spread"] = of_robot.plain()
         without = any(change is not None for change in changes.values())
         trained = not {*self.calibration}.isdisjoint(self.train)
@@ -476,7 +478,8 @@ def _loads_as_points(motions: ObservedMotions) -> ObservedMotions:
     """
     trials = motions.trials
     readings = np.stack([*trials.loads.values()], 2).reshape(*trials.times.shape, -1, 3)
-    names = tuple(f"{name} {kind}" for name in trials.loads for kind in ("force", "moment"))
+    kinds = product(trials.loads, ("force", "moment"))
+    names = tuple(f"{name} {kind}" for name, kind in kinds)
     known = np.isfinite(readings)
     # NaN where there is none
     first = np.take_along_axis(readings, known.argmax(axis=1)[:, None], axis=1)[:, 0]

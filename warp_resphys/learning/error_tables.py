@@ -4,6 +4,7 @@ marker, phase, horizon and scale of the inputs.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Final, TypedDict
 
 import numpy as np
@@ -100,7 +101,7 @@ class ComparedModels:
     def errors(self) -> ErrorTables:
         """Returns the tables that depend on the roll-outs alone."""
         trials, names = self.motions.trials, self.groups["1"]
-        every, count = [name for group in self.groups.values() for name in group], len(names)
+        every, count = [*chain.from_iterable(self.groups.values())], len(names)
         points = counted(self.motions, self.train, every, self.first_frames)
         observed = as_markers(points, trials.labels)
         first = [first_frame(trials, [name]) for name in every]
@@ -134,7 +135,8 @@ class ComparedModels:
             content["per_marker"] = {
                 model: errors_per_marker(x, seen, labels) for model, x in test.items()
             }
-        if bodies := corners_of(trials.labels):
+        bodies = corners_of(trials.labels)
+        if bodies:
             content["orientations_deg"] = {
                 model: {
                     name: _mean_angle(x[:count, :, at], points[:count, :, at])
@@ -142,11 +144,14 @@ class ComparedModels:
                 }
                 for model, x in self.simulated.items()
             }
-        if horizons := self._by_horizon(test, observed):
+        horizons = self._by_horizon(test, observed)
+        if horizons:
             content["horizons"] = horizons
-        if phases := self._by_phase(test, observed):
+        phases = self._by_phase(test, observed)
+        if phases:
             content["phases"] = phases
-        if beyond := beyond_training(self.motions, self.train, names, self.first_frames):
+        beyond = beyond_training(self.motions, self.train, names, self.first_frames)
+        if beyond:
             content["beyond"] = beyond
         if self.loads:
             content["forces"] = self._by_sensor()
@@ -191,7 +196,7 @@ class ComparedModels:
                 m: _errors(x[:, frames], observed[:, frames], [0] * len(observed))
                 for m, x in test.items()
             }
-            if all(len(row) for rows in errors.values() for row in rows):
+            if all(map(len, chain.from_iterable(errors.values()))):
                 found[f"{seconds:g}"] = {model: summarise(rows) for model, rows in errors.items()}
         return found
 
@@ -203,15 +208,13 @@ class ComparedModels:
         at = phases_of(self.motions.trials, names)
         seen = np.isfinite(observed[: len(names)]).all(-1).any(-1)
         frames = {phase: (at == phase) & seen for phase in PHASES}
+
+        def mean(x: FloatArray, rows: BoolArray) -> ErrorSummary:
+            shown = [k for k, at in enumerate(rows) if at.any()]
+            return summarise(marker_errors(x[k, rows[k]], observed[k, rows[k]]) for k in shown)
+
         return {
-            phase: {
-                model: summarise(
-                    marker_errors(x[k, at], observed[k, at])
-                    for k, at in enumerate(rows)
-                    if at.any()
-                )
-                for model, x in test.items()
-            }
+            phase: {model: mean(x, rows) for model, x in test.items()}
             for phase, rows in frames.items()
             if rows.any()
         }

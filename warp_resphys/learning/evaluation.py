@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from itertools import islice
+from itertools import chain, islice
 from typing import Any, Final
 
 import numpy as np
@@ -86,7 +86,8 @@ def evaluate(
         )
     cut_up = rollout_parts(simulator, motions, names, force, parameters, parts.batch)
     parts.run(cut_up)
-    order, rows = [name for part in cut_up for name in part.names], trials.rows(names)
+    order = [*chain.from_iterable(part.names for part in cut_up)]
+    rows = trials.rows(names)
     used = torch.from_numpy(used_frames(trials, names, Identified.of(parameters).first_frames))
     array = "observed" if sensor is None else "loads"
     made = parts.joined(cut_up, array, trials.observed.shape[1])[
@@ -233,7 +234,9 @@ class TrialRollout:
         data_driven: bool = False,
         start: Start | None = None,
     ) -> None:
-        self._simulator, self._motions, self._data_driven = simulator, motions, data_driven
+        self._simulator = simulator
+        self._motions = motions
+        self._data_driven = data_driven
         self._values = {} if identified is None else identified.values(simulator)
         self.replay = motions.replay(simulator, names, identified)
         self.start = motions.start(self.replay, identified) if start is None else start
@@ -253,7 +256,9 @@ class TrialRollout:
             learned: the network.
             replay: of the trials under other inputs; None: `replay`.
         """
-        if (given := len(learned.network.rest)) != (wanted := len(self._simulator.rest_positions)):
+        given = len(learned.network.rest)
+        wanted = len(self._simulator.rest_positions)
+        if given != wanted:
             raise InputError(
                 f"a force on {given} vertices was learned, "
                 f"but the body has {wanted}: learn one for it."
@@ -305,7 +310,9 @@ class TrialRollout:
         They are NaN in an initial state that no equilibrium led to, and infinite where the
         simulation has diverged.
         """
-        before, self._before, sensors = self._before, state, len(self.replay.trials.sensors)
+        before = self._before
+        self._before = state
+        sensors = len(self.replay.trials.sensors)
         resting = number == 0 and self.start.at_rest
         none = state.q.new_full((state.batch, sensors, 6), torch.nan)
         if self._data_driven or not sensors:
@@ -346,7 +353,9 @@ class TrialRollout:
         Args:
             learned: network; None for the simulator alone.
         """
-        motions, observed, steps = self._motions, self.replay.trials.observed, self.steps
+        motions = self._motions
+        observed = self.replay.trials.observed
+        steps = self.steps
         observed = observed[:, : motions.learned_steps(observed.shape[1] - 1) + 1]
         if motions.train_fraction < 1.0:
             steps = min(steps, motions.learned_steps(steps))
@@ -379,7 +388,7 @@ def used_frames(
     """(R, T) whether values were estimated from a frame of some trials, see
     `Identified.first_frames`.
     """
-    seconds = {name: until for shown in first_frames.values() for name, until in shown.items()}
+    seconds = dict(chain.from_iterable(shown.items() for shown in first_frames.values()))
     last = np.array([seconds.get(name, -math.inf) for name in names])
     return np.asarray(trials.times[trials.rows(names)] <= last[:, None] + 1e-9)
 
@@ -406,7 +415,8 @@ def left_out_in_turn(
     alike = [batch for batch in trials.batches(names) if len(batch) > 1]
     count = min(max(map(len, alike), default=0), _FOLDS)
     return [
-        tuple(name for batch in alike for name in batch[number::count]) for number in range(count)
+        tuple(chain.from_iterable(batch[number::count] for batch in alike))
+        for number in range(count)
     ]
 
 
@@ -441,15 +451,16 @@ class HeldOutRollouts:
     @property
     def names(self) -> list[str]:
         """Names of the trials, in the order of the errors."""
-        return [name for batch in self.batches for name in batch]
+        return [*chain.from_iterable(self.batches)]
 
     def amplitudes_mm(self) -> list[float]:
         """Amplitudes of the trials [mm]."""
-        return [1e3 * size for run in self._runs for size in run.replay.trials.amplitude.tolist()]
+        sizes = (run.replay.trials.amplitude.tolist() for run in self._runs)
+        return [1e3 * size for size in chain.from_iterable(sizes)]
 
     def errors(self, learned: Learned | None) -> list[FloatArray]:
         """Mean distances of the points of each trial by frame [mm], see `TrialRollout.errors`."""
-        return [row for run in self._runs for row in run.errors(learned)]
+        return [*chain.from_iterable(run.errors(learned) for run in self._runs)]
 
     def error_mm(self, learned: Learned) -> float:
         """Mean error of a network over the trials [mm]; infinite if a roll-out diverged."""

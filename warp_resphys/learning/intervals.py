@@ -377,7 +377,8 @@ def _quantiles(scores: Sequence[FloatArray], level: float) -> FloatArray:
     """
     quantiles = np.full(scores[0].shape[1], np.inf)
     for m in range(len(quantiles)):
-        used = [trial[np.isfinite(trial)] for trial in (score[:, m].ravel() for score in scores)]
+        of_trials = [score[:, m].ravel() for score in scores]
+        used = [trial[np.isfinite(trial)] for trial in of_trials]
         used = [trial for trial in used if len(trial)]
         if used:
             weights = np.concatenate(

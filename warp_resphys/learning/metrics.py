@@ -189,7 +189,8 @@ def errors_per_marker(
             marker_errors(x[:, m : m + 1], y[:, m : m + 1])
             for x, y in zip(simulated, observed, strict=True)
         ]
-        if of_trials := [of_trial.mean() for of_trial in errors if len(of_trial)]:
+        of_trials = [of_trial.mean() for of_trial in errors if len(of_trial)]
+        if of_trials:
             means[label] = _finite_mean(np.array(of_trials))
     return means
 
@@ -251,8 +252,10 @@ def summarise_folds(folds: Sequence[Mapping[str, ErrorSummary]]) -> dict[str, Er
 
     The models are those of all folds: a law is used in some folds alone.
     """
-    shared = [model for model in folds[0] if all(model in fold for fold in folds)]
-    return {model: _over_folds([fold[model] for fold in folds]) for model in shared}
+    shared = set(folds[0]).intersection(*folds)
+    return {
+        model: _over_folds([fold[model] for fold in folds]) for model in folds[0] if model in shared
+    }
 
 
 def published_errors(name: str) -> Mapping[str, PublishedError]:

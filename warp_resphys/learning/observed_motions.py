@@ -108,7 +108,8 @@ class ObservedMotions(Brief):
 
     def __post_init__(self) -> None:
         """Checks that sensors and readings belong together."""
-        if odd := {*self.sensors} ^ {*self.trials.loads}:
+        odd = {*self.sensors} ^ {*self.trials.loads}
+        if odd:
             raise InputError(
                 f"force sensors are {listed([*self.sensors]) or 'none'}, but the trials have "
                 f"readings of {listed([*self.trials.loads]) or 'none'}: give "
@@ -162,7 +163,9 @@ class ObservedMotions(Brief):
                 raise InputError(
                     f"readings of {name!r} have shape {tuple(readings.shape)}: it must be {wanted}."
                 )
-        count, frames, like = observed.shape[1], len(observed), simulator.rest_positions
+        count = observed.shape[1]
+        frames = len(observed)
+        like = simulator.rest_positions
         observation = observation.to(like)
         at_rest = observation(like.expand(count, -1, -1))
         if observed.shape[2] != (seen := at_rest.shape[1]):

@@ -113,7 +113,9 @@ def by_part(
     shared = {
         name: value for name, value in values.items() if name in ranges and ranges[name].by_part
     }
-    found = {part: value for name, value in shared.items() for part in names.get(name, [name])}
+    found = dict[str, T]()
+    for name, value in shared.items():
+        found |= dict.fromkeys(names.get(name, [name]), value)
     return found | {name: value for name, value in values.items() if name not in shared}
 
 
@@ -184,7 +186,8 @@ def check_ranges(
             raise InputError(
                 f"parameters names {name} and its parts, {', '.join(parts)}: choose one."
             )
-        if (word := command_of(simulator, name)[1]) in _NOT_NEGATIVE and limits.lower < 0.0:
+        word = command_of(simulator, name)[1]
+        if word in _NOT_NEGATIVE and limits.lower < 0.0:
             raise InputError(
                 f"parameters.{name}.lower is {limits.lower:g}: a {word.replace('_', ' ')} is not "
                 "negative: set it to zero or more."

@@ -148,8 +148,12 @@ class Placement:
     def plain(self, labels: Sequence[str]) -> PlainPlacement:
         """Returns the placement as JSON data."""
         offsets = dict(zip(labels, self.offsets.tolist(), strict=True))
-        shift, turn, centre = (x.tolist() for x in (self.shift, self.turn, self.centre))
-        return {"offsets": offsets, "shift": shift, "turn": turn, "centre": centre}
+        return {
+            "offsets": offsets,
+            "shift": self.shift.tolist(),
+            "turn": self.turn.tolist(),
+            "centre": self.centre.tolist(),
+        }
 
     @classmethod
     def none(cls, count: int, centre: torch.Tensor) -> "Placement":

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from itertools import combinations_with_replacement
+from itertools import chain, combinations_with_replacement
 from typing import Final
 
 import numpy as np
@@ -100,10 +100,7 @@ def driving_terms(motions: PlainTrials, trials: PlainTrials, degree: int) -> Flo
         motions.known[:, None], (len(motions.known), frames, motions.known.shape[1])
     )
     inputs = np.concatenate([motions.inputs, known], 2)
-    chosen = (
-        c
-        for d in range(1, degree + 1)
-        for c in combinations_with_replacement(acting_columns(trials).tolist(), d)
-    )
-    columns = [inputs[..., list(term)].prod(-1) for term in chosen]
+    acting = acting_columns(trials).tolist()
+    terms = (combinations_with_replacement(acting, d) for d in range(1, degree + 1))
+    columns = [inputs[..., list(term)].prod(-1) for term in chain.from_iterable(terms)]
     return np.stack([*columns, np.ones(inputs.shape[:2])], 2)

@@ -121,7 +121,9 @@ def _by_trial(trials: PlainTrials) -> Chosen:
 
 def _by_means(trials: PlainTrials) -> list[Chosen]:
     """Ridge regressions of all frames alike on `_Means` of the inputs of motions."""
-    found, rows, whole = list[Chosen](), np.arange(len(trials.values)), _whole(trials)
+    found = list[Chosen]()
+    rows = np.arange(len(trials.values))
+    whole = _whole(trials)
     if trials.values.shape[1] < 2 or not trials.inputs.any():
         return found
     for length, degree in product(range(1, len(_MEANS) + 1), degrees(trials)[:2]):

@@ -32,7 +32,10 @@ _FURTHEST, _TRIED = 3.0, 121
 _DELAYS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # starts of the search, in expected deviations
 _HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of the first J^T J
 _ITERATIONS = 4  # of Levenberg-Marquardt, at most
-_RELEASE_TOLERANCE, _DIFFERENCE, _LONGEST_STEP = 1e-4, 0.05, 3.0  # in expected deviations
+# In expected deviations.
+_RELEASE_TOLERANCE = 1e-4
+_DIFFERENCE = 0.05
+_LONGEST_STEP = 3.0
 
 
 def estimate_release(
@@ -217,15 +220,17 @@ class _FirstFrames(Problem):
         settings: ReleaseSettings,
         parameters: Parameters | None,
     ) -> None:
-        self._replay, self._observe, self._trials = replay, replay.observe, replay.trials
-        self._held, self._settings, self._parameters = held, settings, parameters
+        self._replay = replay
+        self._observe = replay.observe
+        self._trials = replay.trials
+        self._held = held
+        self._settings = settings
+        self._parameters = parameters
         none = held.new_zeros(0, *held[0].shape)
         self._shapes = sideways_shapes(replay.simulator) if settings.sideways > 0.0 else none
         self._sizes = (int(settings.delay > 0.0), len(self._shapes))
         deviations, self._copies = (settings.delay, settings.sideways), dict[int, Replay]()
-        self.deviation = held.new_tensor(
-            [d for d, n in zip(deviations, self._sizes, strict=True) for _ in range(n)]
-        )
+        self.deviation = held.new_tensor(np.repeat(deviations, self._sizes))
 
     def release(self, values: torch.Tensor) -> Start:
         """Returns the releases for values (k R, unknowns); the R motions run fastest."""

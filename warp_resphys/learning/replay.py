@@ -78,12 +78,10 @@ class Replay:
         trials: TrialBatch,
         actuator: Mapping[str, InputNetwork] | None = None,
     ) -> None:
-        self.simulator, self.observe, self.trials, self.actuator = (
-            simulator,
-            observe,
-            trials,
-            actuator or {},
-        )
+        self.simulator = simulator
+        self.observe = observe
+        self.trials = trials
+        self.actuator = actuator or {}
         self.parameter_names = identifiable_parameters(simulator)
         self._shaped = tuple(
             name for name, q in simulator.parameters.items() if q.shape and name != "gravity"
@@ -438,11 +436,9 @@ class Replay:
         """Yields positions (E R, N, 3) of `varied_series` [m],
         and readings, from the release on.
         """
-        (constants, inputs, resting), (their, their_inputs, their_resting), state = (
-            first,
-            others,
-            states[0],
-        )
+        constants, inputs, resting = first
+        their, their_inputs, their_resting = others
+        state = states[0]
         if not start.at_rest:
             whole = self.initial_state(start, constants, resting, 1 + sets)
             varied = whole.map(lambda t: t[state.batch :])

@@ -88,7 +88,8 @@ def at_steps(
     from scipy.interpolate import CubicSpline
 
     since = trials.times if delay is None else (trials.times - delay[:, None]).clamp_min(0.0)
-    times, markers, held = (t.cpu().numpy() for t in (since, trials.observed, trials.held))
+    times = since.cpu().numpy()
+    markers, held = trials.observed.cpu().numpy(), trials.held.cpu().numpy()
     steps = step * np.arange(int(times.max() / step + 1e-6) + 1)
     positions = np.full((len(times), len(steps), *markers.shape[2:]), np.nan)
     for r, m in np.ndindex(len(times), markers.shape[2]):
@@ -124,7 +125,8 @@ def loads_at_steps(
     steps = step * np.arange(count)
     series = np.full((len(since), count, *loads.shape[2:]), np.nan)
     for row, sensor, axis in np.ndindex(len(since), *loads.shape[2:]):
-        known = np.isfinite(values := loads[row, :, sensor, axis])
+        values = loads[row, :, sensor, axis]
+        known = np.isfinite(values)
         if known.any():
             times, frame = since[row, known], np.diff(since[row]).max(initial=step)
             near = np.abs(steps[:, None] - times).min(1) <= _NEAR * frame

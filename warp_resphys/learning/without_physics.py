@@ -132,10 +132,13 @@ def _at_steps(trials: Trials, learned: Sequence[str], asked: Sequence[str]) -> T
     times = step * np.arange(int(np.ceil(last / step - 1e-6)) + 1)
     observed = np.full((len(trials.names), len(times), *trials.observed.shape[2:]), np.nan)
     if rows:
-        trial_times, seen, held = (
-            torch.from_numpy(x[rows]) for x in (trials.times, trials.observed, trials.held)
+        batch = TrialBatch(
+            tuple(learned),
+            torch.from_numpy(trials.times[rows]),
+            torch.from_numpy(trials.observed[rows]),
+            torch.from_numpy(trials.held[rows]),
         )
-        positions = at_steps(TrialBatch(tuple(learned), trial_times, seen, held), step)
+        positions = at_steps(batch, step)
         observed[rows, : positions.shape[1]] = positions
     return replace(
         trials, times=np.broadcast_to(times, (len(trials.names), len(times))), observed=observed
@@ -174,7 +177,8 @@ def _batches(trials: Trials, names: Sequence[str], alone: Sequence[str]) -> Iter
     """Trials that begin in the same way; some by themselves."""
     for batch in trials.batches(names):
         yield from ([name] for name in batch if name in alone)
-        if others := [name for name in batch if name not in alone]:
+        others = [name for name in batch if name not in alone]
+        if others:
             yield others
 
 

@@ -1,5 +1,7 @@
 """A simulated laboratory of pictures of a body of another material, before a camera elsewhere."""
 
+from itertools import product
+
 import numpy as np
 import scipy.ndimage
 import shapely
@@ -90,7 +92,7 @@ def play_camera(context: StageContext) -> None:
                 there = camera.pixels(places, corrections).numpy()
                 tracks.append(there + played.noise * random.normal(size=there.shape))
         if pose.points is not None:
-            heads = ["frame", *(f"{name}.{axis}" for name in data.points for axis in "xy")]
+            heads = ["frame", *(f"{name}.{axis}" for name, axis in product(data.points, "xy"))]
             table = np.column_stack([np.arange(len(tracks)), np.reshape(tracks, (len(tracks), -1))])
             with atomic_path(path.parent / pose.points) as partial:
                 np.savetxt(partial, table, "%.10g", ",", header=",".join(heads), comments="")

@@ -10,6 +10,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,6 +29,7 @@ from ..io.resuming import Stage, StageContext, package_versions, resources_used,
 from ..io.safe_files import atomic_hdf5, create, read_json, write_json
 from ..learning.identification.search import (
     Identification,
+    Searches,
     first_points,
     refined_searches,
     search_parameters,
@@ -92,9 +94,8 @@ def picture_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
     if data.folder is None:
         of_poses = {pose.folder: [SCENE, pose.points] for pose in data.poses.values()}
         for pose in data.poses.values():
-            of_poses[pose.folder] += [
-                file for files in frame_files(data, pose) for file in files.values()
-            ]
+            for files_of_frame in frame_files(data, pose):
+                of_poses[pose.folder] += files_of_frame.values()
         written = tuple(
             f"recordings/{folder}/{file}"
             for folder, files in of_poses.items()
@@ -182,7 +183,9 @@ class _Plan:
         run_dir: Path,
         cameras: Mapping[str, Mapping[str, list[list[float]]]] | None = None,
     ) -> None:
-        self.settings, self.data, self.poses = settings, settings.data, SeenPoses(settings, run_dir)
+        self.settings = settings
+        self.data = settings.data
+        self.poses = SeenPoses(settings, run_dir)
         self._cameras = {
             name: {
                 lens: torch.tensor(camera, dtype=torch.float64) for lens, camera in by_lens.items()
@@ -205,7 +208,7 @@ class _Plan:
                 "all": [""],
                 "material": [pose.material for pose in poses],
                 "trial": [pose.name for pose in poses],
-                "lens": [lens for pose in poses for lens in pose.lenses],
+                "lens": [*chain.from_iterable(pose.lenses for pose in poses)],
             }
             shared = limits.owner or "all"
             for owner in dict.fromkeys(owners[shared]) if chosen(name, shared) else ():
@@ -349,25 +352,22 @@ def identify_pictures(context: StageContext) -> None:
     misfit = PictureMisfit(poses, bounds, plan.clamp_turns(poses))
     guess, kept = plan.guess(bounds, poses), context.run_dir / f"{context.name}_parts.safetensors"
     first = (guess, wanted.starts, wanted.candidates, settings.seed)
-    options = (
+    searches = Searches(
         wanted.max_evaluations,
         wanted.tolerance,
         Checkpoint(kept, context.fingerprint),
         context.name,
+        starts=wanted.starts,
     )
-    (found,) = refined_searches(
-        lambda before: (misfit, first_points(misfit, *first)), *options, starts=wanted.starts
-    )
+    (found,) = refined_searches(lambda before: (misfit, first_points(misfit, *first)), searches)
     result = replace(found, first_guess=guess).plain()
-    cameras = {
-        pose.name: {
+    cameras = {}
+    for pose in poses if settings.data.stands else ():
+        cameras[pose.name] = {
             photo.lens: photo.camera.pose.tolist()
             for photo in pose.photos
             if photo.camera.lens is not None
         }
-        for pose in poses
-        if settings.data.stands
-    }
     write_json(context.run_dir / IDENTIFICATION, {"sysid": result, "cameras": cameras})
     for material in dict.fromkeys(pose.material for pose in poses):
         pose = next(pose for pose in poses if pose.material == material)

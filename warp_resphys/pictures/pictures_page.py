@@ -4,6 +4,7 @@ their distances, and the parameters.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -114,11 +115,12 @@ def picture_verdict(results: Sequence[PictureResult]) -> list[str]:
     doubts = [] if shown[0].tested else ["no pose was kept back"]
     if abs(errors["sysid"] - errors["simulation"]) < (1.0 - _BETTER) * errors["simulation"]:
         doubts.append("these poses hardly depend on the material, and do not test it")
-    if lost := [
+    lost = [
         result.pose
         for result in results
         if (common := result.overlap["sysid"]) is not None and common < _COVERED
-    ]:
+    ]
+    if lost:
         doubts.append(f"{listed(lost)} hardly overlap: check the camera, the mesh and the mask")
     advice = [f"Check before use: {'; '.join(doubts)}."] if doubts else []
     return [f"{text[0].upper()}{text[1:]}.", *advice]
@@ -315,9 +317,8 @@ def draw_clouds(
                 if f"{_FIRST}_places" in file[f"{result.pose}/{frame}"]
             )
             clouds.append((result, _seen_from_the_side(file[f"{result.pose}/{number}"], up)))
-    most = max(
-        float(np.quantile(distances, _SHOWN)) for _, seen in clouds for _, distances, _ in seen[1:]
-    )
+    identified = chain.from_iterable(seen[1:] for _, seen in clouds)
+    most = max(float(np.quantile(distances, _SHOWN)) for _, distances, _ in identified)
     figure = Figure(
         figsize=(len(_MODELS) * _CLOUD_PANEL, len(clouds) * _CLOUD_PANEL * 0.8),
         layout="constrained",
@@ -325,9 +326,8 @@ def draw_clouds(
     axes = figure.subplots(len(clouds), len(_MODELS), squeeze=False)
     dots = None
     for (result, seen), row in zip(clouds, axes, strict=True):
-        ends = np.concatenate(
-            [part.reshape(-1, 2) for places, _, body in seen for part in (places, body)]
-        )
+        drawn = chain.from_iterable((places, body) for places, _, body in seen)
+        ends = np.concatenate([part.reshape(-1, 2) for part in drawn])
         low, high = _frame_of(ends, _CLOUD_MARGIN * float(np.ptp(ends, axis=0).max()))
         for model, axis, (places, distances, body) in zip(_MODELS, row, seen, strict=True):
             axis.add_collection(
@@ -351,10 +351,11 @@ def draw_clouds(
         "of their distances: the undeformed body, the simulator with the parameters of the data "
         "sheet, and the identified one."
     )
-    alt = "; ".join(
-        f"{result.pose}: {', '.join(_text(result.cloud_mm[model]) for model in _MODELS)} mm"
-        for result, _ in panels
-    )
+    texts = []
+    for result, _ in panels:
+        distances_mm = ", ".join(_text(result.cloud_mm[model]) for model in _MODELS)
+        texts.append(f"{result.pose}: {distances_mm} mm")
+    alt = "; ".join(texts)
     return Drawn.of(
         path, f"Clouds of points on bodies. Mean distances of the three models: {alt}.", caption
     )
@@ -372,9 +373,9 @@ def _seen_from_the_side(group: h5py.Group, up: FloatArray) -> list[tuple[FloatAr
     axes = np.stack([np.linalg.eigh(level @ np.cov(shape.T) @ level)[1][:, -1], up], 1)
     seen = list[tuple[FloatArray, ...]]()
     for model in _MODELS:
-        places, distances, surface = (
-            read_array(group, f"{model}_{key}") for key in ("places", "distances", "surface")
-        )
+        places = read_array(group, f"{model}_places")
+        distances = read_array(group, f"{model}_distances")
+        surface = read_array(group, f"{model}_surface")
         seen.append((places @ axes, 1e3 * distances, surface[triangles] @ axes))
     return seen
 

@@ -5,6 +5,7 @@ and the files of pictures to `SeenPose`.
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -80,7 +81,7 @@ def picture_files(data: PictureData) -> dict[str, str]:
         beside = [pose.mesh, pose.points, pose.cloud]
         paths += [scene.path] if scene.path.exists() else []
         paths += [scene.path.parent / name for name in beside if name is not None]
-        paths += [path for frame in scene.frames for path in frame.files]
+        paths += chain.from_iterable(frame.files for frame in scene.frames)
     result = {}
     for path in paths:
         try:
@@ -100,7 +101,8 @@ def scene_of(data: PictureData, pose: PoseSettings, run_dir: Path) -> SceneFile:
         InputError: a chosen frame, or a lens, is not there.
     """
     scene = read_scene(scene_file(data, pose, run_dir), pose.cloud is not None)
-    if wrong := [number for number in pose.frames or () if number >= len(scene.frames)]:
+    wrong = [number for number in pose.frames or () if number >= len(scene.frames)]
+    if wrong:
         raise InputError(
             f"the frames of {pose.folder} in data.poses name {wrong[0]}, but {scene.path} has "
             f"{len(scene.frames)}, from 0: leave it out."
@@ -205,7 +207,9 @@ def _without_copies(scene: SceneFile, name: str) -> SceneFile:
     if len(different) < len(scene.frames):
         log.warning(
             "import: %d of the %d pictures of %s are copies of others, and are left out",
-            *(len(scene.frames) - len(different), len(scene.frames), name),
+            len(scene.frames) - len(different),
+            len(scene.frames),
+            name,
         )
     return replace(scene, frames=(*different.values(),))
 
@@ -217,7 +221,9 @@ def _shown(
 
     None without.
     """
-    colours, pictured, mask = pose.mask or data.mask, frame.image != frame.depth, None
+    colours = pose.mask or data.mask
+    pictured = frame.image != frame.depth
+    mask = None
     deep = frame.depth if pose.depth else None
     if pose.outline or (
         deep is not None and (frame.mask is not None or (colours is not None and pictured))
@@ -262,7 +268,8 @@ def _cameras(path: Path, frames: Sequence[Frame], data: PictureData) -> FloatArr
     Refused if a standing one sees the origin of the mesh at different places.
     """
     if data.tag is None:
-        if missing := [frame.image.name for frame in frames if frame.pose is None]:
+        missing = [frame.image.name for frame in frames if frame.pose is None]
+        if missing:
             raise DataFileError(
                 f"{path}: {missing[0]} has no 'world_to_camera': give it, or the tag of data.tag."
             )
@@ -270,7 +277,8 @@ def _cameras(path: Path, frames: Sequence[Frame], data: PictureData) -> FloatArr
     else:
         tag, lenses = data.tag, read_lenses(data)
         poses = [tag_poses(tag, read_picture(frame.image), lenses[frame.lens]) for frame in frames]
-        if hidden := [frame.image for frame, pair in zip(frames, poses, strict=True) if not pair]:
+        hidden = [frame.image for frame, pair in zip(frames, poses, strict=True) if not pair]
+        if hidden:
             raise DataFileError(
                 f"{hidden[0]} does not show the tag {tag.number} of {tag.dictionary}: check "
                 "data.tag, leave the frame out, or give its world_to_camera."
@@ -304,7 +312,9 @@ class SeenPoses:
     """
 
     def __init__(self, settings: StageSettings, run_dir: Path) -> None:
-        self.settings, self.data, self.run_dir = settings, settings.data, run_dir
+        self.settings = settings
+        self.data = settings.data
+        self.run_dir = run_dir
         self.lenses, self._poses = read_lenses(self.data), dict[str, SeenPose]()
         # Arrays of each pose in pictures.h5, by name.
         self._loaded: dict[str, dict[str, NDArray[Any]]] = {}
@@ -360,7 +370,9 @@ class SeenPoses:
         """
         if name in self._poses:
             return self._poses[name]
-        settings, wanted, loaded = self.settings, self.data.poses[name], self._loaded[name]
+        settings = self.settings
+        wanted = self.data.poses[name]
+        loaded = self._loaded[name]
         mesh, clamps = self._mesh(name)
         fixed = np.unique(np.concatenate(clamps))
         material = self.material(name)
@@ -390,7 +402,8 @@ class SeenPoses:
             row_time = self.data.lenses[frame.lens].row_time
             title, time = f"{wanted.folder}/{frame.image.name}", frame.time or 0.0
             photos.append(Photo(title, camera, outline, tracked, cloud, frame.lens, time, row_time))
-        if (scan := loaded.get("scan")) is not None:
+        scan = loaded.get("scan")
+        if scan is not None:
             camera = PlacedCamera(None, torch.as_tensor(scene.scan_pose), centre)
             outside = scan + loaded["scan_normals"] if "scan_normals" in loaded else None
             cloud = self._cloud(
@@ -422,7 +435,8 @@ class SeenPoses:
         else:
             mesh = read_mesh(scene.path.parent / pose.mesh, self.data.units)
         corners = len(mesh.vertices)
-        if wrong := [clamp for clamp in scene.clamps if clamp.min() < 0 or clamp.max() >= corners]:
+        wrong = [clamp for clamp in scene.clamps if clamp.min() < 0 or clamp.max() >= corners]
+        if wrong:
             raise DataFileError(
                 f"{scene.path}: 'fixed' has vertices from {wrong[0].min()} to {wrong[0].max()}, "
                 f"but the mesh has those from 0 to {corners - 1}."

@@ -117,7 +117,9 @@ def risen_and_fallen(data: RunReport, driven: Driven) -> tuple[FloatArray, Float
     and what acts in that part.
     """
     trials = np.concatenate([*driven.values.values()])
-    high, mean, count = trials.max(0), trials.mean(0), trials.shape[1]
+    high = trials.max(0)
+    mean = trials.mean(0)
+    count = trials.shape[1]
     ramp = np.linspace(0.0, 1.0, _STEPS)
     ramp = np.concatenate([ramp, ramp[::-1]])
     parameters = data.identification["sysid"].parameters if "sysid" in data.identification else {}

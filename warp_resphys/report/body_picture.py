@@ -164,7 +164,9 @@ def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list
     normal[np.ptp(vertices, axis=0).argmax()] = 0.0  # The body is cut along its longest side.
     plane = np.stack([normal, vertices.mean(axis=0)])
     solid = mesh.cells[:, : ELEMENTS[mesh.element.linear].nodes]
-    lift, bright, cut_light = _LIFT * size, (0.6, 0.6), (0.55, 0.6)
+    lift = _LIFT * size
+    bright = (0.6, 0.6)
+    cut_light = (0.55, 0.6)
     balls = Layer("balls", markers, None, MEASURED, size=_DOT * size, light=(0.6, 0.5))
     clamped = Layer(
         "balls", vertices[summary.fixed], None, FIXED, size=0.5 * _DOT * size, light=(0.7, 0.3)
@@ -273,9 +275,11 @@ def _translucent(mesh: Mesh, fixed: IntArray, line: float, radius: float) -> lis
         Layer("surface", q, triangles, BODY, opacity=0.42, light=(0.78, 0.28)),
         Layer("lines", q, face_edges(mesh), opacity=0.22, size=line, shift=0.1 * radius),
     ]
-    if len(sharp := sharp_edges(q, triangles)):
+    sharp = sharp_edges(q, triangles)
+    if len(sharp):
         layers.append(Layer("lines", q, sharp, FIXED, opacity=0.75, size=1.8 * line))
-    if len(clamped := triangles[np.isin(triangles, fixed).all(axis=1)]):
+    clamped = triangles[np.isin(triangles, fixed).all(axis=1)]
+    if len(clamped):
         layers.append(
             Layer("surface", q, clamped, FIXED, opacity=0.75, light=(0.7, 0.22), shift=0.1 * radius)
         )

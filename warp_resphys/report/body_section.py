@@ -76,7 +76,8 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
     rule = "" if not driven.limit else f"; dashed, the limit of {quantity.shown(driven.limit)}"
     left_out = f"; unused {quantity.per}s are left out" * (len(driven.used) < len(driven.channels))
     what, words = f"{quantity.plural.capitalize()} of {parts}", quantity.plural.capitalize()
-    if over_time := input_sequences(driven, trials):
+    over_time = input_sequences(driven, trials)
+    if over_time:
         figure = _sequences(driven, trials.time_step, over_time)
         shown = f"{what} over time: {', '.join(over_time)}."
         whose = "a few trials" if len(driven.values) > 1 else "the trial"

@@ -174,7 +174,9 @@ def _beyond(run: Judged) -> Iterator[str]:
     """Yields test trials whose loads, inputs or displacements lie beyond those
     of the training, and models there.
     """
-    tests, excess, left = list[str](), dict[str, Mapping[str, float]](), dict[str, float]()
+    tests = list[str]()
+    excess = dict[str, Mapping[str, float]]()
+    left = dict[str, float]()
     for fold in run.folds:
         tests += [row["name"] for row in fold.get("per_trajectory", ())]
         excess |= fold.get("beyond", {})
@@ -240,11 +242,13 @@ def _registration(run: Judged) -> Iterator[str]:
     if off:
         named = in_a_row([f"{label} ({mm_text(away)})" for label, away in off.items()])
         yield f"registration: {named} left out, as far from the nominal position; {CAUSES}"
-    if (turned := max((placement["turned_deg"] for placement in placed), default=0.0)) > _TURNED:
+    turned = max((placement["turned_deg"] for placement in placed), default=0.0)
+    if turned > _TURNED:
         text = f"registration: the markers are rotated by {turned:.1f}° from it"
         yield f"{text}; check the positions of the markers, and the axes of recordings and mesh"
     error = fmean(run.known[run.model]) if run.model in run.known else math.inf
-    if (rms := max((placement["rms_mm"] for placement in placed), default=0.0)) > error:
+    rms = max((placement["rms_mm"] for placement in placed), default=0.0)
+    if rms > error:
         text = (
             f"registration: the markers at rest fit their nominal positions to {mm_text(rms)} only"
         )
@@ -271,7 +275,8 @@ def _refused(run: Judged) -> Iterator[str]:
             f"as it is not clearly closer to the trials than {against}"
         )
     for model in (model for model in CORRECTED if model in run.errors):
-        if lost := sum(error is None for error in run.errors[model]):
+        lost = sum(error is None for error in run.errors[model])
+        if lost:
             best = best_of(run.known, SIMULATORS)
             use = f"; use {model_words(best)}" if best else ""
             yield (

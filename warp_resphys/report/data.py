@@ -3,6 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import chain
 from statistics import fmean
 from typing import NotRequired, TypedDict
 
@@ -173,11 +174,12 @@ class TrialResults:
 
     def of_tip(self, tip: IntArray) -> "TrialResults":
         """Returns the same trials with the mean of some vertices (P,) as the only marker."""
-        target, bound, *simulated = (
-            q[..., tip, :].mean(-2, keepdims=True)
-            for q in (self.target, self.bound, *self.positions.values())
-        )
-        positions = dict(zip(self.positions, simulated, strict=True))
+
+        def mean(q: FloatArray) -> FloatArray:
+            return np.asarray(q[..., tip, :].mean(-2, keepdims=True))
+
+        positions = {model: mean(q) for model, q in self.positions.items()}
+        target, bound = mean(self.target), mean(self.bound)
         return replace(self, labels=("tip",), target=target, bound=bound, positions=positions)
 
 
@@ -334,18 +336,14 @@ def force_errors(metrics: Metrics) -> dict[str, tuple[str, float, dict[str, floa
     """
     found = dict[str, tuple[str, float, dict[str, float | None]]]()
     folds = [fold["forces"] for fold in folds_in(metrics) if "forces" in fold]
-    for name in dict.fromkeys(name for fold in folds for name in fold):
+    for name in dict.fromkeys(chain.from_iterable(folds)):
         tables = [fold[name] for fold in folds if name in fold]
-        shared = [
-            model
-            for model in tables[0]["models"]
-            if all(model in table["models"] for table in tables)
-        ]
-        means = {model: [table["models"][model]["mean"] for table in tables] for model in shared}
-        errors = {
-            m: None if None in of else fmean(x for x in of if x is not None)
-            for m, of in means.items()
-        }
+        errors = dict[str, float | None]()
+        for model in tables[0]["models"]:
+            if all(model in table["models"] for table in tables):
+                means = [table["models"][model]["mean"] for table in tables]
+                known = [mean for mean in means if mean is not None]
+                errors[model] = fmean(known) if len(known) == len(means) else None
         found[name] = tables[0]["unit"], fmean(table["size"] for table in tables), errors
     return found
 
@@ -360,7 +358,8 @@ def trial_errors(metrics: Metrics, others: Collection[str] = (), outside: bool =
         others: names of the test trials outside of the training loads.
         outside: whether the errors are those on these trials, or on all that are not among them.
     """
-    every = [row for fold in folds_in(metrics) for row in fold.get("per_trajectory", ())]
+    folds = folds_in(metrics)
+    every = [*chain.from_iterable(fold.get("per_trajectory", ()) for fold in folds)]
     rows = [row for row in every if (row["name"] in others) is outside]
     models = [
         model
@@ -388,11 +387,8 @@ def grouped_errors(metrics: Metrics, settings: RunSettings) -> dict[str, Errors]
 
 def missing_baselines(metrics: Metrics) -> dict[str, str]:
     """Returns why predictions without physics are missing, by model."""
-    return {
-        model: why
-        for fold in folds_in(metrics)
-        for model, why in fold.get("missing_baselines", {}).items()
-    }
+    reasons = (fold.get("missing_baselines", {}) for fold in folds_in(metrics))
+    return dict(chain.from_iterable(of_fold.items() for of_fold in reasons))
 
 
 def best_and_worst(trials: TrialResults) -> list[int]:

@@ -48,17 +48,16 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
             panels = {f"{kind} ({number_of(rows.sum(), 'trial')})": rows for kind, rows in by_load}
         figure = error_over_time(trials.errors_mm, times, of, window, panels)
         blocks.append(canvas.figure("error_over_time", figure, alt, _error_caption(data, window)))
-    if by_model := metrics.get("per_marker"):
-        shown = [
-            label
-            for label in trials.labels
-            if any(label in markers for markers in by_model.values())
-        ]
+    by_model = metrics.get("per_marker")
+    if by_model:
+        known = set[str]().union(*by_model.values())
+        shown = [label for label in trials.labels if label in known]
         by_label = {
             label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown
         }
         blocks.append(model_table("Each marker [mm]", numbers(by_label), metrics["errors_mm"]))
-    if forces := force_errors(metrics):
+    forces = force_errors(metrics)
+    if forces:
         for name, curve in data.forces.items():
             alt = (
                 f"{curve.axis} of {name} over time in the test trial {curve.trial}, "
@@ -78,7 +77,8 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
             "without zero and drift, where the sensor has them."
         )
         blocks.append(model_table("Force", numbers(by_sensor), metrics["errors_mm"], note))
-    if by_phase := metrics.get("phases"):
+    by_phase = metrics.get("phases")
+    if by_phase:
         rows = {
             phase.capitalize(): {m: summary["mean"] for m, summary in models.items()}
             for phase, models in by_phase.items()
@@ -90,7 +90,8 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         blocks.append(
             model_table("Phase; mean error [mm]", numbers(rows), metrics["errors_mm"], note)
         )
-    if turned := metrics.get("orientations_deg"):
+    turned = metrics.get("orientations_deg")
+    if turned:
         bodies = next(iter(turned.values()))
         by_body = {name: {m: angles[name] for m, angles in turned.items()} for name in bodies}
         blocks.append(
@@ -98,7 +99,8 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
                 "Orientation of each rigid body [degrees]", numbers(by_body), metrics["errors_mm"]
             )
         )
-    if check := metrics.get("mesh_check"):
+    check = metrics.get("mesh_check")
+    if check:
         blocks += [Text("Error of the mesh", heading=True), Text(mesh_text(check))]
     return Part("Error over time" if trials.moves else "Each marker", blocks) if blocks else None
 
@@ -223,7 +225,8 @@ def training_section(data: RunReport, canvas: Canvas) -> Part | None:
     """Returns the curves of the trainings, and which weights were kept."""
     blocks: list[Any] = []
     for model, (name, *_) in MODELS.items():
-        if records := data.training.get(model):
+        records = data.training.get(model)
+        if records:
             alt = (
                 f"Losses and validation roll-out error of the training of {name}, "
                 f"{len(records)} epochs."
@@ -270,7 +273,8 @@ def training_curves(records: Sequence[Mapping[str, float | None]]) -> Figure:
             axes["losses"].plot(epochs, losses, color=colour, label=label, **thin)
     axes["losses"].set_ylabel("loss")
     axes["losses"].legend(loc="lower right", bbox_to_anchor=(1.0, 1.02), ncols=2)
-    if (curve := axes.get("rollout_error_mm")) is not None:
+    curve = axes.get("rollout_error_mm")
+    if curve is not None:
         epochs, errors = measured("rollout_error_mm")
         curve.plot(epochs, errors, color=strong)
         curve.set_ylabel("roll-out\nerror [mm]")

@@ -123,7 +123,8 @@ def themed_svg(figure: Figure, name: str) -> bytes:
 @in_style()
 def settle(figure: Figure) -> None:
     """Computes the layout of a figure once, for all files that are written of it."""
-    if (engine := figure.get_layout_engine()) is not None:
+    engine = figure.get_layout_engine()
+    if engine is not None:
         engine.execute(figure)
         figure.set_layout_engine(None)
 

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
+from itertools import chain, product
 from typing import Any, Final
 
 import numpy as np
@@ -94,9 +95,8 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
         else {name: body.length for name, body in markers.rigid_bodies.items()}
     )
     blocks += [Text(placement_text(name, placement, lengths)) for name, placement in placed.items()]
-    if histories := {
-        name: result.history for name, result in identified.items() if any(result.history)
-    }:
+    histories = {name: result.history for name, result in identified.items() if any(result.history)}
+    if histories:
         alt = (
             "Loss of the identification over its evaluations, with a line for each start, on a "
             "logarithmic axis."
@@ -119,7 +119,7 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
     figure = figures.new_figure(2.6)
     panels = list(figure.subplots(1, len(histories), sharey=True, squeeze=False).flat)
     for axes, (name, starts) in zip(panels, histories.items(), strict=True):
-        ends = [record["loss"] for start in starts for record in start]
+        ends = [record["loss"] for record in chain.from_iterable(starts)]
         for start in filter(None, starts):
             losses = np.fmin.accumulate(
                 np.array([record["loss"] for record in start], dtype=np.float64)
@@ -174,10 +174,10 @@ def trials_table(identified: Identification) -> PageTable | None:
     values, deviations = identified.of_trials, identified.of_trials_deviation
     if not values:
         return None
-    parameters = {
-        parameter: parameter_wording(parameter)
-        for parameter in (split_name(name)[0] for name in values)
-    }
+    parameters = {}
+    for name in values:
+        parameter = split_name(name)[0]
+        parameters[parameter] = parameter_wording(parameter)
     owners = list(dict.fromkeys(split_name(name)[1] for name in values))
     heads = [f"{words} [{unit}]" if unit else words for words, unit, _ in parameters.values()]
 
@@ -229,8 +229,7 @@ def parameter_wording(parameter: str) -> Wording:
     names = (parameter, parameter.rpartition("_")[0])
     fits = (
         (unit, factor)
-        for name in names
-        for pattern, unit, factor in _UNITS
+        for name, (pattern, unit, factor) in product(names, _UNITS)
         if re.fullmatch(pattern, name)
     )
     return words[0].upper() + words[1:], *next(fits, ("", 1.0))

@@ -10,6 +10,7 @@ the kernels.
 
 import re
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -159,7 +160,8 @@ def wording(name: str) -> tuple[Wording, str]:
     if name in _TERMS:
         words, meaning, (unit, factor) = _TERMS[name]
         return (words, unit, factor), meaning
-    if exponents := [*ogden_terms({name: 0.0})]:
+    exponents = [*ogden_terms({name: 0.0})]
+    if exponents:
         return (f"Ogden's term of exponent {exponents[0]}", *_KPA), _OGDEN
     numbered = re.fullmatch(r"(\w+)_(\d+)", name)
     if numbered and numbered[1] in _NUMBERED:
@@ -209,7 +211,7 @@ def not_needed_text(law: LawContent, settings: LawSettings) -> str:
     """
     parameters = {name: value for name, value in law["parameters"].items() if value}
     names = [name for name in settings.terms if name not in parameters]
-    exponents = [str(n) for name in names for n in ogden_terms({name: 0.0})]
+    exponents = [*map(str, chain.from_iterable(ogden_terms({name: 0.0}) for name in names))]
     absent = [
         within_sentence(wording(name)[0][0]) for name in names if not ogden_terms({name: 0.0})
     ]
@@ -260,9 +262,8 @@ def _moduli_table(data: RunReport, parameters: Mapping[str, float]) -> PageTable
         row("Poisson's ratio", "poissons_ratio", 1.0),
     ]
     notes = ["Of slow motions: viscosity and relaxing branches left out."]
-    if branches := sum(
-        value for name, value in parameters.items() if name.startswith("prony_modulus")
-    ):
+    branches = sum(value for name, value in parameters.items() if name.startswith("prony_modulus"))
+    if branches:
         fast = 1e-3 * (law.mu + branches)
         notes.append(
             "With the relaxing branches, in fast motions, "
@@ -314,10 +315,8 @@ def _curve(data: RunReport, parameters: Mapping[str, float], canvas: Canvas) -> 
         label=f"E at small strains, {modulus:.3g} kPa",
     )
     axes.axhline(0.0, color=TONES["muted"].light, linewidth=0.6)
-    low, high = (
-        extreme([extreme(stress) for stress in curves.values()])
-        for extreme in (np.nanmin, np.nanmax)
-    )
+    low = np.nanmin([np.nanmin(stress) for stress in curves.values()])
+    high = np.nanmax([np.nanmax(stress) for stress in curves.values()])
     margin = 0.1 * (high - low)
     axes.set(xlim=(stretches[0], stretches[-1]), ylim=(low - margin, high + margin))
     axes.set(xlabel="stretch", ylabel="nominal stress [kPa]")
@@ -504,7 +503,9 @@ def _energy(
     c10, c20, c30, c01, c02, dilation, bulk_1, bulk_2 = (
         parameters.get(name, 0.0) for name in _ISOTROPIC
     )
-    j, first, second = s.prod() - 1.0, s.square().sum(), _pairs(s.square())
+    j = s.prod() - 1.0
+    first = s.square().sum()
+    second = _pairs(s.square())
     a, b = first - 3.0 - 2.0 * j + j**2, second - 3.0 - 4.0 * j
     energy = (
         c10 * a

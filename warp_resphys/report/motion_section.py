@@ -176,7 +176,9 @@ def _instants_figure(
     caption = f"{name} at {len(titles)} instants, one with the largest error of the grey body."
     when = ", ".join(titles)
     if len(motion.times) == 1:  # A pose.
-        titles, caption, when = [""], f"{name}.", "rest"
+        titles = [""]
+        caption = f"{name}."
+        when = "rest"
     caption += (
         " Drawn to scale; "
         f"{'below, the view from below' if motion.from_below else 'the second view follows'}"
@@ -192,7 +194,8 @@ def _instants_figure(
     if data.metrics["errors_mm"][last]["diverged"]:
         caption += f" Where {MODELS[last].name} is not drawn, it has diverged."
     alt = f"The deformed body at {when}, with observed and simulated markers."
-    count, height, width, _ = frames.shape
+    count = len(frames)
+    height, width = frames.shape[1:3]
     figure = figures.new_figure(4.0 * height / width * figures.WIDE / count + 0.35)
     panels = figure.subplots(2, count, squeeze=False)
     for row, frame, title in zip(panels.T, frames, titles, strict=True):
@@ -210,7 +213,8 @@ def view_in_space(
 
     With a target, vertices are compared with it; without one, markers are compared.
     """
-    mesh, obstacles, surface = motion.mesh, motion.obstacles, surface_vertices(motion.mesh)
+    mesh, obstacles = motion.mesh, motion.obstacles
+    surface = surface_vertices(motion.mesh)
     rest, faces = mesh.vertices[surface], np.searchsorted(surface, boundary_triangles(mesh))
     size = float(np.ptp(mesh.vertices, axis=0).max())
     finite = partial(without_diverged, far=_DIVERGED * size)
@@ -219,10 +223,14 @@ def view_in_space(
     axes = motion_axes(motion.gravity, np.concatenate([rest[None], *places]))
     points = np.concatenate([rest, places.reshape(-1, 3)])
     centre, half = frame_of(np.concatenate([points, obstacles.near(points)]), axes)
-    has_markers, simulated, target = True, np.stack([*motion.markers.values()]), motion.measured
+    has_markers = True
+    simulated = np.stack([*motion.markers.values()])
+    target = motion.measured
     compared = np.arange(len(motion.bound))
     if motion.target is not None:
-        has_markers, target, compared = False, motion.target, surface
+        has_markers = False
+        target = motion.target
+        compared = surface
         simulated = np.stack([finite(q, mesh.vertices) for q in motion.positions.values()])
     means = mean_distance(simulated, np.broadcast_to(target, simulated.shape))  # (B, F) [mm]
     largest, shares = _error_shares(simulated[:, :, compared], target[:, compared], places)
@@ -310,7 +318,7 @@ def reduced(
         Vectors of unit length, or one of zeros for bodies at rest, and weights [m], NaN in frames
         that are left out.
     """
-    count, frames, *_ = displacements.shape
+    count, frames = displacements.shape[:2]
     rows = displacements.reshape(count * frames, -1)
     finite = np.isfinite(rows).all(axis=1)
     remaining = rows[finite].copy()

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from importlib import resources
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypedDict, TypeVar
 
@@ -306,7 +307,8 @@ def write_page(
     )
     # The script that some blocks need, and its digest for the content security policy.
     script, digest = "", ""
-    if any(isinstance(block, ViewInSpace) for part in parts for block in part.blocks):
+    blocks = chain.from_iterable(part.blocks for part in parts)
+    if any(isinstance(block, ViewInSpace) for block in blocks):
         script = resources.files(__package__).joinpath("view.js").read_text(encoding="utf-8")
         digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     page = environment.get_template("page.html").render(
@@ -352,7 +354,8 @@ def _finished(parts: Sequence[Part]) -> Iterator[Part]:
 
 def _times(metrics: Usage) -> Iterator[Part]:
     """Yields the section on computing times and memory; nothing without times."""
-    if seconds := metrics.get("seconds"):
+    seconds = metrics.get("seconds")
+    if seconds:
         stages = {**seconds, "Sum, also of stages that ran at once": sum(seconds.values())}
         rows = [Row(stage, [Cell(duration_text(spent))]) for stage, spent in stages.items()]
         one = metrics.get("seconds_per_test_trajectory", {})

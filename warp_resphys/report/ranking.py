@@ -100,7 +100,8 @@ def unused(metrics: Metrics) -> dict[str, str]:
     tests: dict[str, list[HeldOutTest]] = {}
     for fold in folds_in(metrics):
         for model, kept in fold.get("networks", {}).items():
-            if (test := kept.get("test")) is not None:
+            test = kept.get("test")
+            if test is not None:
                 tests.setdefault(model, []).append(test)
     return {
         model: text_of(found[0])

@@ -1,6 +1,7 @@
 """Sections of the page of a run: errors by trial, horizon and input, and its recordings."""
 
 from collections.abc import Mapping, Sequence
+from itertools import chain, product
 from statistics import fmean
 from typing import Final
 
@@ -62,7 +63,9 @@ def details_table(metrics: Metrics, settings: RunSettings) -> PageTable:
     With two groups of test trials, each has a column; published errors are of trials as in
     training.
     """
-    errors, groups, idle = metrics["errors_mm"], grouped_errors(metrics, settings), unused(metrics)
+    errors = metrics["errors_mm"]
+    groups = grouped_errors(metrics, settings)
+    idle = unused(metrics)
     published = published_beside(published_errors(settings.name), list(errors))
     beside = {"Published": {model: Cell.of(error) for model, error in published.items()}}
     columns: dict[str, dict[str, Cell]] = {}
@@ -130,21 +133,13 @@ def model_table(
         small: Printed below the heads of rows.
     """
     others = [model for model in BASELINES if model not in models_in_figures(errors)]
-    models = [
-        model
-        for model in MODELS
-        if any(model in row for row in rows.values()) and model not in others
-    ]
+    known = set[str]().union(*rows.values()).difference(others)
+    models = [model for model in MODELS if model in known]
     addresses, below = pages or {}, small or {}
-    body = [
-        Row(
-            n,
-            [r.get(m, Cell(NONE)) for m in models],
-            small=below.get(n, ""),
-            address=addresses.get(n, ""),
-        )
-        for n, r in rows.items()
-    ]
+    body = []
+    for name, row in rows.items():
+        cells = [row.get(model, Cell(NONE)) for model in models]
+        body.append(Row(name, cells, small=below.get(name, ""), address=addresses.get(name, "")))
     return PageTable(head, [MODELS[model].name for model in models], body, note)
 
 
@@ -159,7 +154,8 @@ def numbers(rows: Mapping[str, Mapping[str, float | None]]) -> dict[str, dict[st
 def trials_section(data: RunReport, canvas: Canvas) -> Part | None:
     """Returns the errors on each held-out trial, and what could explain the errors that remain."""
     folds = folds_in(data.metrics)
-    trials = {row["name"]: row for fold in folds for row in fold.get("per_trajectory", ())}
+    of_folds = chain.from_iterable(fold.get("per_trajectory", ()) for fold in folds)
+    trials = {row["name"]: row for row in of_folds}
     covered = data.metrics.get("intervals", {}).get("models", {})
     order = (data.metrics.get("recommended", ""), *reversed(_CHAIN))
     by_trial: Mapping[str, float] = next(
@@ -189,7 +185,8 @@ def trials_section(data: RunReport, canvas: Canvas) -> Part | None:
     )
     fits = [fold["free_fits"] for fold in folds if "free_fits" in fold]
     merged = {
-        model: [row for by_model in fits for row in by_model.get(model, ())] for model in _CHAIN
+        model: [*chain.from_iterable(by_model.get(model, ()) for by_model in fits)]
+        for model in _CHAIN
     }
     tables += rest_table(merged, data.driven)
     return Part("Trial by trial", tables) if tables else None
@@ -202,7 +199,8 @@ def rest_table(fits: Mapping[str, Sequence[FreeFit]], driven: Driven | None) -> 
     """
     means = {model: fmean(row["as_is_mm"] for row in rows) for model, rows in fits.items() if rows}
     model = min(means, key=lambda name: means[name], default="")
-    shown = [key for key in _REFITTED if any(key in row["left_mm"] for row in fits.get(model, ()))]
+    known = set[str]().union(*(row["left_mm"] for row in fits.get(model, ())))
+    shown = [key for key in _REFITTED if key in known]
     if not shown:
         return []
 
@@ -335,7 +333,7 @@ def mounting_table(residuals: Mapping[str, RegistrationSummary]) -> PageTable | 
     mounted = {trial: fit["mounting"] for trial, fit in residuals.items() if "mounting" in fit}
     if not mounted:
         return None
-    names = list(dict.fromkeys(name for poses in mounted.values() for name in poses))
+    names = list(dict.fromkeys(chain.from_iterable(mounted.values())))
     rows = []
     for trial, poses in mounted.items():
         known = [poses.get(name) for name in names]
@@ -343,8 +341,8 @@ def mounting_table(residuals: Mapping[str, RegistrationSummary]) -> PageTable | 
             (f"{x['distance_mm']:.2f}", f"{x['angle_deg']:.2f}") if x else (NONE, NONE)
             for x in known
         ]
-        rows.append(Row(trial, [Cell(text) for pair in cells for text in pair]))
-    columns = [f"{name} [{unit}]" for name in names for unit in ("mm", "degrees")]
+        rows.append(Row(trial, [Cell(text) for text in chain.from_iterable(cells)]))
+    columns = [f"{name} [{unit}]" for name, unit in product(names, ("mm", "degrees"))]
     note = (
         "Distance and angle of a rigid body at rest from its mounting, which is the mean over "
         "the training trials."
@@ -356,9 +354,8 @@ def residual_table(residuals: Mapping[str, RegistrationSummary]) -> PageTable:
     """Returns the residuals of the registration [mm] by trial and marker,
     or the largest of many markers and trials.
     """
-    labels = list(
-        dict.fromkeys(label for fit in residuals.values() for label in fit["residual_mm"])
-    )
+    by_marker = [fit["residual_mm"] for fit in residuals.values()]
+    labels = list(dict.fromkeys(chain.from_iterable(by_marker)))
     head, last = "Residual [mm]", "Root mean square"
     note = (
         "Distance of each marker at rest "
@@ -377,17 +374,16 @@ def residual_table(residuals: Mapping[str, RegistrationSummary]) -> PageTable:
         rows = [Row(label, [cell(fit, label) for fit in residuals.values()]) for label in labels]
         return PageTable(head, list(residuals), [*rows, Row(last, list(rms.values()))], note)
     if len(labels) <= _MOST_WIDE:
-        rows = [
-            Row(t, [*(cell(fit, label) for label in labels), rms[t]])
-            for t, fit in residuals.items()
-        ]
+        rows = []
+        for trial, fit in residuals.items():
+            cells = [cell(fit, label) for label in labels]
+            rows.append(Row(trial, [*cells, rms[trial]]))
         return PageTable(head, [*labels, last], rows, note)
-    known = {
-        t: {x: mm for x, mm in fit["residual_mm"].items() if mm is not None}
-        for t, fit in residuals.items()
-    }
-    worst = {t: max(by_marker, key=by_marker.__getitem__) for t, by_marker in known.items()}
-    rows = [Row(t, [cell(fit, worst[t]), Cell(worst[t]), rms[t]]) for t, fit in residuals.items()]
+    rows = []
+    for trial, fit in residuals.items():
+        known = {label: mm for label, mm in fit["residual_mm"].items() if mm is not None}
+        worst = max(known, key=known.__getitem__)
+        rows.append(Row(trial, [cell(fit, worst), Cell(worst), rms[trial]]))
     return PageTable(head, ["Largest", "Marker", last], rows, note)
 
 
@@ -453,7 +449,8 @@ def shapes_table(shapes: Mapping[str, ShapeErrors], note: str = "") -> PageTable
     """Returns the errors by body and model, and the shares
     of the uncorrected simulator's error that are removed.
     """
-    models = [model for model in MODELS if any(model in r["errors_mm"] for r in shapes.values())]
+    known = set[str]().union(*(result["errors_mm"] for result in shapes.values()))
+    models = [model for model in MODELS if model in known]
     rows = []
     for name, result in shapes.items():
         errors, cells = result["errors_mm"], []

@@ -6,6 +6,7 @@ alike. What speaks against relying on the verdict are its `conditions`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from statistics import fmean
 from typing import Final
 
@@ -82,26 +83,20 @@ def results_table(metrics: Metrics, settings: RunSettings) -> PageTable:
     best = best_of(known_errors(last, idle), RANKED)
     mark = "best beyond the training" if len(groups) > 1 else "best"
     rows = []
-    if named := [model_words(model) for model in dict.fromkeys(plain.values()) if model]:
+    named = [model_words(model) for model in dict.fromkeys(plain.values()) if model]
+    if named:
         cells = [columns[title].get(model, Cell("")) for title, model in plain.items()]
         rows.append(Row(f"without physics ({', '.join(named)})", cells, mark * (best in BASELINES)))
-    rows += [
-        Row(
-            text,
-            [by_model.get(model, Cell("")) for by_model in columns.values()],
-            mark * (model == best),
-        )
-        for model, text in _ROWS.items()
-        if any(model in by_model for by_model in columns.values())
-    ]
+    shown = set[str]().union(*columns.values())
+    for model, text in _ROWS.items():
+        if model in shown:
+            cells = [by_model.get(model, Cell("")) for by_model in columns.values()]
+            rows.append(Row(text, cells, mark * (model == best)))
     of = "vertices" if settings.markers is None else "markers"
     lacking = [f"{model_words(model)} ({why})" for model, why in missing_baselines(metrics).items()]
     note = f"Missing: {'; '.join(lacking)}." if lacking else ""
-    first = {
-        owner: shown
-        for fold in folds_in(metrics)
-        for owner, shown in fold.get("first_frames", {}).items()
-    }
+    of_folds = (fold.get("first_frames", {}) for fold in folds_in(metrics))
+    first = dict(chain.from_iterable(frames.items() for frames in of_folds))
     note = " ".join(filter(None, (note, first_frames_text(first))))
     return PageTable(f"{settings.heading}: mean error of the {of} [mm]", list(columns), rows, note)
 
@@ -111,7 +106,8 @@ def error_cell(errors: Sequence[float | None], with_interval: bool = False) -> C
     or how many roll-outs diverged.
     """
     known = [error for error in errors if error is not None]
-    if lost := len(errors) - len(known):
+    lost = len(errors) - len(known)
+    if lost:
         return Cell(f"{lost} of {len(errors)} diverged")
     return Cell(number_text(fmean(known)), interval_text(errors) if with_interval else "")
 
@@ -157,7 +153,8 @@ def verdict(metrics: Metrics, settings: RunSettings) -> list[str]:
         f"{played}{beyond}{_best_text(known)}{_at_rest(every)}" if known else "all models diverged"
     ]
     inside = every[0] if len(groups) > 1 else {}
-    if (best := best_of(inside, RANKED)) and len(inside[best]) >= LEAST_EVIDENCE:
+    best = best_of(inside, RANKED)
+    if best and len(inside[best]) >= LEAST_EVIDENCE:
         texts.append(
             f"within them, {model_words(best)} is {'enough' if best in BASELINES else 'best'}"
         )

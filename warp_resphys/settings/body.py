@@ -141,11 +141,11 @@ class MaterialSettings(_Parameters):
         """Values by parameter of the simulator, such
         as ``tip_youngs_modulus`` for a region ``tip``.
         """
-        return {
-            f"{region}_{name}" if region else name: value
-            for region, material in self.by_region.items()
-            for name, value in material.values.items()
-        }
+        found = dict[str, float]()
+        for region, material in self.by_region.items():
+            prefix = f"{region}_" if region else ""
+            found |= {f"{prefix}{name}": value for name, value in material.values.items()}
+        return found
 
 
 class PartSettings(Settings):
@@ -309,6 +309,11 @@ class BodySettings(Settings):
                 "fixed is null, and obstacles has none that the body lies on: name fixed vertices."
             )
         return self
+
+    @property
+    def meshes(self) -> tuple[MeshSettings, ...]:
+        """The mesh and those of the parts."""
+        return (self.mesh, *(part.mesh for part in self.parts.values()))
 
 
 class SteppedSettings(BodySettings):

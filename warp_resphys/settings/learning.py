@@ -110,10 +110,10 @@ class Bounds(Settings):
 
     def to_unit(self, value: float) -> float:
         """Returns a value as a fraction of the range, 0 to 1."""
-        low, high, x = (
-            math.log(v) if self.logarithmic else v for v in (self.lower, self.upper, value)
-        )
-        return (x - low) / (high - low)
+        if self.logarithmic:
+            low = math.log(self.lower)
+            return (math.log(value) - low) / (math.log(self.upper) - low)
+        return (value - self.lower) / (self.upper - self.lower)
 
     def from_unit(self, unit: "torch.Tensor") -> "torch.Tensor":
         """Returns the values at fractions of the range; differentiable."""

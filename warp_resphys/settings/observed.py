@@ -3,6 +3,7 @@ how they follow the body, and their registration.
 """
 
 import math
+from itertools import product
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
@@ -113,7 +114,7 @@ class BindingSettings(Settings):
         """Labels of the M observed points: tracked markers, then four points of each rigid body."""
         return (
             *self.tracked,
-            *(f"{name} {corner}" for name in self.rigid_bodies for corner in CORNERS),
+            *(f"{name} {corner}" for name, corner in product(self.rigid_bodies, CORNERS)),
         )
 
 
@@ -144,15 +145,17 @@ class MarkerSettings(BindingSettings):
 
     @model_validator(mode="after")
     def _are_bound(self) -> Self:
-        if both := [label for label in self.tracked if label in self.reference]:
+        both = [label for label in self.tracked if label in self.reference]
+        if both:
             raise ValueError(
                 f"tracked and markers.reference both have '{both[0]}': it moves or is fixed."
             )
-        if unknown := [
+        unknown = [
             label
             for label in self.register_with or ()
             if label not in (*self.tracked, *self.reference)
-        ]:
+        ]
+        if unknown:
             raise ValueError(
                 f"register_with names '{unknown[0]}', which is in neither tracked nor reference: "
                 f"choose from {', '.join((*self.tracked, *self.reference))}."
@@ -161,7 +164,8 @@ class MarkerSettings(BindingSettings):
             raise ValueError(
                 "tracked is empty: name the markers that errors are measured on, with their places."
             )
-        if both := [name for name in self.rigid_bodies if name in (*self.tracked, *self.reference)]:
+        both = [name for name in self.rigid_bodies if name in (*self.tracked, *self.reference)]
+        if both:
             raise ValueError(
                 f"rigid_bodies has '{both[0]}', which is a marker in tracked or reference, too: "
                 "its place is not given, but estimated, so name it in rigid_bodies alone."

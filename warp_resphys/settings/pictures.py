@@ -179,17 +179,20 @@ class PictureData(WithoutMotion):
     @model_validator(mode="after")
     def _are_known(self) -> Self:
         for key, names in (("train", self.train), ("test", self.test)):
-            if unknown := [name for name in names if name not in self.poses]:
+            unknown = [name for name in names if name not in self.poses]
+            if unknown:
                 raise ValueError(
                     f"{key} names '{unknown[0]}': data.poses has {', '.join(self.poses)}."
                 )
-        if both := [name for name in self.train if name in self.test]:
+        both = [name for name in self.train if name in self.test]
+        if both:
             raise ValueError(
                 f"test names '{both[0]}', which is in data.train as well: take one out."
             )
-        if pointed := [
+        pointed = [
             name for name, pose in self.poses.items() if pose.points is not None and not self.points
-        ]:
+        ]
+        if pointed:
             raise ValueError(
                 f"points is empty, and data.poses.{pointed[0]} has some: give their places, "
                 "{tip: [x, y, z]}."
@@ -205,11 +208,13 @@ class PictureData(WithoutMotion):
             "data.lens": [*self.lenses],
         }
         for (first, mine), (second, others) in combinations(owners.items(), 2):
-            if both := [name for name in mine if name in others]:
+            both = [name for name in mine if name in others]
+            if both:
                 raise ValueError(f"{first} and {second} both have '{both[0]}': rename one.")
-        if unseen := {self.poses[name].material for name in self.test} - {
+        unseen = {self.poses[name].material for name in self.test} - {
             self.poses[n].material for n in self.train
-        }:
+        }
+        if unseen:
             raise ValueError(
                 f"test has a pose of {min(map(str, unseen))}, "
                 "of which no pose is in data.train: take it out."

@@ -53,17 +53,20 @@ def _check_data(run: RunKeys) -> None:
                 "law is null, but data.kind is material_tests: give its terms, "
                 "law={terms: [ogden_3]}."
             )
-        if lost := _OF_SPECIMENS - {*run.simulation.values}:
+        lost = _OF_SPECIMENS - {*run.simulation.values}
+        if lost:
             raise ValueError(
                 f"simulation lacks {min(lost)}, which tests of specimens do not show: give it."
             )
-        if more := {*run.simulation.values} - _OF_SPECIMENS:
+        more = {*run.simulation.values} - _OF_SPECIMENS
+        if more:
             raise ValueError(
                 f"simulation has {min(more)}, which tests of specimens identify, "
                 "or lack: leave it out."
             )
         unset = LawSettings()
-        if idle := [key for key in _OF_TRIALS if getattr(run.law, key) != getattr(unset, key)]:
+        idle = [key for key in _OF_TRIALS if getattr(run.law, key) != getattr(unset, key)]
+        if idle:
             raise ValueError(
                 f"law.{idle[0]} is for laws from trials, "
                 "and data.kind is material_tests: leave it out."
@@ -163,7 +166,8 @@ def _check_obstacles(run: RunKeys) -> None:
                 f"data.obstacle_motion.{recorded[0]} is recorded by a marker of its name, but "
                 "markers.labels is assigned: use recordings with names, or give the motion."
             )
-        if both := [name for name in recorded if name in taken]:
+        both = [name for name in recorded if name in taken]
+        if both:
             raise ValueError(
                 f"data.obstacle_motion.{both[0]} is recorded by a marker of its name, which is "
                 "one of the body, too: give the obstacle another name."
@@ -236,7 +240,8 @@ def _check_control(run: RunKeys) -> None:
         )
     simulated: list[str] = [model for model in run.models if model != "simfree"]
     for key, models in (("models", control.models), ("receding", control.receding)):
-        if unknown := [model for model in models if model not in simulated]:
+        unknown = [model for model in models if model not in simulated]
+        if unknown:
             raise ValueError(
                 f"control.{key} has {unknown[0]}: this experiment has {', '.join(simulated)}."
             )
@@ -244,7 +249,8 @@ def _check_control(run: RunKeys) -> None:
         raise ValueError(
             f"control.receding must be among control.models, which are {', '.join(control.models)}."
         )
-    if missing := [label for label in control.tracked if label not in run.markers.tracked]:
+    missing = [label for label in control.tracked if label not in run.markers.tracked]
+    if missing:
         tracked = ", ".join(run.markers.tracked)
         raise ValueError(f"control.tracked names '{missing[0]}': markers.tracked has {tracked}.")
     limits = control.limits
@@ -256,7 +262,8 @@ def _check_control(run: RunKeys) -> None:
             f"data.input_limit of {data.input_limit:g} at most, "
             "the largest input of the training."
         )
-    if short := [seconds for seconds in control.seconds if seconds < _LEAST_STEPS * run.time_step]:
+    short = [seconds for seconds in control.seconds if seconds < _LEAST_STEPS * run.time_step]
+    if short:
         raise ValueError(
             f"control.seconds has {short[0]:g}: a path takes {_LEAST_STEPS} steps at least."
         )

@@ -9,6 +9,7 @@ during which inputs are constant.
 import logging
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -48,9 +49,10 @@ def import_recordings(context: StageContext) -> None:
     _check_input_unit(recorded)
     names = [trial.name for trial in recorded.trials]
     sessions = [trial.session for trial in recorded.trials]
-    if text := sessions_text(
+    text = sessions_text(
         {n: r.rate for n, r in zip(names, recorded.measured, strict=True)}, sessions
-    ):
+    )
+    if text:
         log.warning("import: %s", text)
     training = names if context.settings.learned is None else context.settings.learned
     offsets = _offsets(recorded)
@@ -212,8 +214,11 @@ def _mountings(
         log.info(
             "import: %s is mounted %.1f mm from the centre of what carries it, turned by %.1f "
             "degrees; the trials differ from this by up to %.2f mm and %.2f degrees",
-            *(name, _MILLI * np.linalg.norm(np.mean(bound[corners] - nominal, axis=0))),
-            *(np.degrees(angles(nominal, bound[corners])), away.max(), turned.max()),
+            name,
+            _MILLI * np.linalg.norm(np.mean(bound[corners] - nominal, axis=0)),
+            np.degrees(angles(nominal, bound[corners])),
+            away.max(),
+            turned.max(),
         )
     return mountings
 
@@ -297,15 +302,10 @@ def _dataset(
         if UNDER_INPUTS in begins:
             first = [r.actuation[0] for r in recorded.moving if r.actuation is not None]
             driven["resting"] = {name: np.array(first)}
-    obstacles = {
-        name: _motion(
-            recorded,
-            f"the obstacle {name!r}",
-            [r.obstacles.get(name) for r in recorded.moving],
-            at_steps,
-        )
-        for name in dict.fromkeys(name for r in recorded.moving for name in r.obstacles)
-    }
+    obstacles = {}
+    for name in dict.fromkeys(chain.from_iterable(r.obstacles for r in recorded.moving)):
+        poses = [r.obstacles.get(name) for r in recorded.moving]
+        obstacles[name] = _motion(recorded, f"the obstacle {name!r}", poses, at_steps)
     sessions = tuple(trial.session or "" for trial in trials)
     return Trials(
         names=tuple(trial.name for trial in trials),
@@ -365,7 +365,8 @@ def _series(
         steps: time steps of driven trials; None without such trials.
         least: least number T of frames.
     """
-    trials, cutoff, step = recorded.trials, recorded.data.cutoff, recorded.settings.time_step
+    trials = recorded.trials
+    cutoff = recorded.data.cutoff
     lengths = [
         len(moving.positions) if t.is_released else 1
         for t, moving in zip(trials, recorded.moving, strict=True)
@@ -387,7 +388,7 @@ def _series(
         if trial.is_released:
             times[row] = np.pad(moving.time, (0, frames - len(seen)), mode="edge")
         elif trial.begins in RESTING:
-            times[row] = np.minimum(np.arange(frames), steps or 0) * step
+            times[row] = np.minimum(np.arange(frames), steps or 0) * recorded.settings.time_step
             held[row] = np.where(np.isfinite(observed[row, 0]), observed[row, 0], held[row])
         else:
             # The displacement of a static pose counts from the undeformed body.
@@ -412,7 +413,8 @@ def _inputs(recorded: RegisteredTrials, steps: int, parts: int) -> FloatArray:
         log.warning(
             "import: recordings are shorter than the %d steps of data.steps (%s); "
             "missing frames are ignored.",
-            *(steps, ", ".join(short)),
+            steps,
+            ", ".join(short),
         )
     return inputs
 
@@ -454,7 +456,9 @@ def _registration(recorded: RegisteredTrials, row: int, shifts: FloatArray) -> R
     """Content of registration.json on a trial, in millimetres
     but for positions in the frame of the body [m].
     """
-    markers, fit, tracked = recorded.markers, recorded.registrations[row], recorded.tracked
+    markers = recorded.markers
+    fit = recorded.registrations[row]
+    tracked = recorded.tracked
     # Places of the tracked markers of a loaded body are not known, and do not concern the
     # registration.
     known = [*markers.reference, *(markers.tracked if recorded.shows_places[row] else [])]

@@ -71,7 +71,9 @@ class Reader:
         assert settings.markers is not None
         assert isinstance(settings.data, ReadingSettings)
         self.data: ReadingSettings = settings.data
-        self.settings, self.markers, self.trials = settings, settings.markers, trials
+        self.settings = settings
+        self.markers = settings.markers
+        self.trials = trials
         self.body = build_body(settings)
         self.drive = drive_of(settings, self.body)
         self.tracked = list(self.markers.observed)
@@ -115,7 +117,8 @@ class Reader:
         """Refuses trials without markers, durations,
         limits of their inputs, or a place for their payload.
         """
-        data, drive, begins = self.data, self.drive, {trial.begins for trial in self.trials}
+        data, drive = self.data, self.drive
+        begins = {trial.begins for trial in self.trials}
         for trial in self.trials:
             if not self.tracked_in(trial):
                 raise InputError(
@@ -172,7 +175,8 @@ class Reader:
                 "the axes of the recordings along which the body's x, y and z are in data.axes, "
                 "such as [x, y, z]."
             )
-        if (count := len(self.markers.tracked) + standing) < enough:
+        count = len(self.markers.tracked) + standing
+        if count < enough:
             raise InputError(
                 f"markers.tracked and markers.reference name {number_of(count, 'marker')}: "
                 "registration needs at least 3, or 2 with data.up, or 1 with data.axes."
@@ -264,7 +268,8 @@ class Reader:
         result, lacking = [], dict[tuple[str, str], list[str]]()
         for trial, recording in zip(trials, recordings, strict=True):
             labels = self.labels(trial)
-            if absent := [label for label in self.tracked if label not in labels]:
+            absent = [label for label in self.tracked if label not in labels]
+            if absent:
                 unused = [label for label in trial.labels or () if label not in owners(labels)]
                 lacking.setdefault(
                     (listed(owners(absent)), listed(unused) if unused else ""), []
@@ -304,7 +309,8 @@ class Reader:
             recording = read_recording(
                 trial.file, data.units, data.rate, trial.labels, data.table, data.bag
             )
-        if unread := [name for name in recording.loads if name not in self.settings.sensors]:
+        unread = [name for name in recording.loads if name not in self.settings.sensors]
+        if unread:
             log.warning(
                 "import: %s has force sensors that are not in sensors: %s",
                 recording.source.name,
@@ -390,7 +396,8 @@ class Reader:
                 labelled.append(recording)
                 continue
             expected, labels = self.expected(trial, places[trial.name]), self.labels(trial)
-            if (unseen := self.view(trial).unseen) is not None:  # The recordings have no depth.
+            unseen = self.view(trial).unseen
+            if unseen is not None:  # The recordings have no depth.
                 expected[:, unseen] = 0.0
             standing = list(range(len(self.tracked), len(labels)))
             still = slice(-_count(POSE_SECONDS, recording), None)
@@ -409,7 +416,9 @@ class Reader:
             log.info(
                 "import: the markers of %s are assigned by their places, to %.1f mm (next best "
                 "assignment: %.1f mm)",
-                *(trial.name, _MILLI * rms, _MILLI * next_rms),
+                trial.name,
+                _MILLI * rms,
+                _MILLI * next_rms,
             )
             rest = None if recording.rest is None else recording.rest[columns]
             positions = recording.positions[:, columns]
@@ -422,9 +431,8 @@ class Reader:
         """Inputs of the body in static poses."""
         like, fields = self.simulator.rest_positions, {}
         if self.drive is not None:
-            if lacking := [
-                recording.source for recording in recordings if recording.actuation is None
-            ]:
+            lacking = [recording.source for recording in recordings if recording.actuation is None]
+            if lacking:
                 raise DataFileError(
                     f"{lacking[0]} has no inputs of the body: add them to the file, or as "
                     "data.trials.NAME.inputs."

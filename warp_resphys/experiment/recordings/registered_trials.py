@@ -125,7 +125,9 @@ class RegisteredTrials(Reader):
             log.info(
                 "import: %s has %g frames per second and the simulation %g steps: simulated "
                 "motions are interpolated at the frames",
-                *(recording.source.name, recording.rate, 1.0 / self.settings.time_step),
+                recording.source.name,
+                recording.rate,
+                1.0 / self.settings.time_step,
             )
         if trial.begins == "released":
             return recording, _START
@@ -215,11 +217,12 @@ class RegisteredTrials(Reader):
         rest = _central(recording.frames(slice(*release.rest)), tracked, np.median, "is held")
         filled = fill_gaps(recording.select(tracked), self.data.longest_gap)
         moving = trim_to_release(filled, release, seconds=self.data.seconds)
-        if lost := [
+        lost = [
             label
             for label, seen in zip(moving.labels, moving.seen.T, strict=True)
             if not seen.any()
-        ]:
+        ]
+        if lost:
             raise DataFileError(
                 f"{moving.source}: {listed(owners(lost))} cannot be seen in the "
                 f"{self.data.seconds:g} s after the release; "
@@ -309,7 +312,9 @@ class RegisteredTrials(Reader):
             )
         off = defaultdict[tuple[str, ...], list[int]](list)
         for row, fit in fits.items():
-            name, release, size = self.trials[row].name, self.releases[row], _MILLI * fit.rms
+            name = self.trials[row].name
+            release = self.releases[row]
+            size = _MILLI * fit.rms
             if release is not None:
                 log.info(
                     "import: %s is released in frame %.1f, registered to %.2f mm",
@@ -341,11 +346,15 @@ class RegisteredTrials(Reader):
         In their own frame, tracked markers do not depend on the pose of the body: any motion
         registers them.
         """
-        trial, recording, places = self.trials[row], self.measured[row], self.rests[row]
+        trial = self.trials[row]
+        recording = self.measured[row]
+        places = self.rests[row]
         if trial.is_released and self.data.rest == "file":
             assert recording.rest is not None
             places = recording.rest
-        chosen, view, rotation = self.markers.register_with, self.view(trial), self.rotation
+        chosen = self.markers.register_with
+        view = self.view(trial)
+        rotation = self.rotation
         use = (
             [*self.markers.reference]
             if only_reference
@@ -362,7 +371,9 @@ class RegisteredTrials(Reader):
                 [view.of_arrays(places[:count] @ rotation.T) @ rotation, places[count:]]
             )
         return register_markers(
-            *(places, expected, recording.labels),
+            places,
+            expected,
+            recording.labels,
             source=recording.source,
             largest_residual=self.markers.largest_residual,
             use=use,
@@ -420,9 +431,8 @@ class RegisteredTrials(Reader):
                 rigid(early).apply(np.broadcast_to(self.nominal, (len(early), *self.nominal.shape)))
                 - self.nominal
             )
-            if (
-                furthest := float(np.linalg.norm(shift, axis=-1).max())
-            ) > self.markers.largest_residual:
+            furthest = float(np.linalg.norm(shift, axis=-1).max())
+            if furthest > self.markers.largest_residual:
                 raise DataFileError(
                     f"{whole.source}: {what} by {_MILLI * furthest:.1f} mm during registration: "
                     "keep it still until the release, or in the first data.rest_seconds."
@@ -489,9 +499,8 @@ def _check_rest(recording: Recording, tracked: Sequence[str]) -> None:
         for label in tracked
         if not np.isfinite(recording.rest[recording.labels.index(label)]).all()
     ]
-    if turned := [
-        name for name, corners in corners_of(tracked).items() if tracked[corners][0] in lost
-    ]:
+    turned = [name for name, corners in corners_of(tracked).items() if tracked[corners][0] in lost]
+    if turned:
         raise DataFileError(
             f"{recording.source}: 'rest' has no orientation of {listed(turned)}: set data.rest "
             "to held, with frames in which the body is held undeformed."

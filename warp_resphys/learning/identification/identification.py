@@ -10,6 +10,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from statistics import fmean
 
@@ -39,7 +40,7 @@ from ..placement import Accuracy, PlainPlacements
 from ..replay import Replay
 from ..start import Start
 from .misfit import Misfit
-from .search import Identification, first_points, refined_searches, search_parameters
+from .search import Identification, Searches, first_points, refined_searches, search_parameters
 
 log = logging.getLogger(__name__)
 
@@ -151,9 +152,12 @@ def identify(
         first = first_search if before is None else (before.parameters,)
         return misfit, first_points(misfit, *first)
 
+    searches = Searches(
+        max_evaluations, tolerance, Checkpoint(kept, *searched), "identify", starts=starts
+    )
     rounds = refined_searches(
-        *(begin, max_evaluations, tolerance, Checkpoint(kept, *searched), "identify"),
-        starts=starts,
+        begin,
+        searches,
         labels=motions.labels,
         released=RELEASED in map(motions.trials.begin_of, trials),
     )
@@ -193,13 +197,13 @@ def _bounds_of_owners(
 ) -> dict[str, Bounds]:
     """Bounds of all parameters, and of the values of trials and sessions."""
     owners = {"session": list(dict.fromkeys(map(trials.session, names))), "trial": [*names]}
-    return {
-        full: limits
-        for name, limits in ranges.items()
-        for full in (
-            [value_name(name, owner) for owner in owners[limits.owner]] if limits.owner else [name]
-        )
-    }
+    found = dict[str, Bounds]()
+    for name, limits in ranges.items():
+        full_names = [name]
+        if limits.owner:
+            full_names = [value_name(name, owner) for owner in owners[limits.owner]]
+        found |= dict.fromkeys(full_names, limits)
+    return found
 
 
 def _guess(name: str, bounds: Bounds, known: Mapping[str, float]) -> float:
@@ -220,7 +224,7 @@ def _joined(
         (records for records in history if records),
         key=lambda records: min(record["loss"] for record in records),
     )
-    best.extend(record for later in rounds[1:] for record in later.history[0])
+    best.extend(chain.from_iterable(later.history[0] for later in rounds[1:]))
     found = replace(rounds[-1], history=history, first_guess=guess)
     if (
         found.placement is None
@@ -257,7 +261,8 @@ def _separated(found: Identification, ranges: Mapping[str, Bounds]) -> Identific
         name: p.mean for name, p in priors.items()
     }
     found = replace(found, parameters=parameters, of_trials=of_trials)
-    if (uncertainty := found.uncertainty) is None:
+    uncertainty = found.uncertainty
+    if uncertainty is None:
         return found
     rows = [names.index(name) for name in common]
     correlation = np.eye(len(common) + len(priors))
@@ -301,9 +306,8 @@ def _shown_first(
     shown = list[tuple[list[str], dict[str, Bounds]]]()
     for (session, trial), names in groups.items():
         owners = ("trial",) if trial else ("session", "trial")
-        if not (
-            wanted := {name: limits for name, limits in ranges.items() if limits.owner in owners}
-        ):
+        wanted = {name: limits for name, limits in ranges.items() if limits.owner in owners}
+        if not wanted:
             continue
         times, observed = (x[trials.rows(names)] for x in (trials.times, trials.observed))
         frames = np.isfinite(observed).all(-1).any(-1) & (times <= seconds + 1e-9)
@@ -352,9 +356,7 @@ def _with_first_frames(
         )
         return found
     owners = dict.fromkeys(split_name(full)[1] for full in bounds)
-    first = {
-        owner: {name: window for name in ([owner] if owner in names else names)} for owner in owners
-    }
+    first = {owner: dict.fromkeys([owner] if owner in names else names, window) for owner in owners}
     return replace(
         found,
         of_trials={**found.of_trials, **result.parameters},

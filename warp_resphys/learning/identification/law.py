@@ -166,7 +166,7 @@ def fit_classes(
     names = [name for name, members in groups.items() if members]
     laws = dict[tuple[int, ...], LawClass]()
     for chosen in chain.from_iterable(combinations(names, size) for size in range(len(names) + 1)):
-        kept = _sparse(columns, modulus, [k for name in chosen for k in groups[name]])
+        kept = _sparse(columns, modulus, [*chain.from_iterable(groups[name] for name in chosen)])
         coefficients, residual = columns.fit(kept)
         parameters = _parameters([columns.candidates[k] for k in kept], coefficients)
         laws.setdefault(tuple(kept), LawClass(chosen, parameters, residual))
@@ -383,12 +383,10 @@ def branches_of(
     """Parameters of branches by their moduli [Pa] and relaxation times [s],
     numbered from `first`.
     """
-    pairs = enumerate(zip(moduli, times, strict=True), first)
-    return {
-        key: x
-        for k, (m, t) in pairs
-        for key, x in ((f"prony_modulus_{k}", m), (f"prony_time_{k}", t))
-    }
+    found = dict[str, float]()
+    for k, (modulus, time) in enumerate(zip(moduli, times, strict=True), first):
+        found |= {f"prony_modulus_{k}": modulus, f"prony_time_{k}": time}
+    return found
 
 
 def family(tension: float, direction: tuple[float, float] = (0.0, 0.0)) -> dict[str, float]:

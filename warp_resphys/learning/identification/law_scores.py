@@ -5,6 +5,7 @@ a search by these, and the stretches of a body.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -135,7 +136,7 @@ def tried_without_states(
         "fibres": family(0.3 * shear, longest_side(mesh)) if wanted.families else {},
     }
     groups = {name: added for name, added in groups.items() if added}
-    whole = {name: value for added in groups.values() for name, value in added.items()}
+    whole = dict(chain.from_iterable(added.items() for added in groups.values()))
     best = refine(LawClass(tuple(groups), start | whole, math.nan))
     tried = [best]
     for name in groups:

@@ -45,7 +45,7 @@ from .law import (
 )
 from .law_scores import RefinedLaw, scores_of, stretches_in, tried_without_states
 from .misfit import Misfit
-from .search import Identification, first_points, refined_searches
+from .search import Identification, Searches, first_points, refined_searches
 from .weak_form import KnownMotion, WeakForm
 
 _OF_MASS: Final = ("density", MASS_DAMPING)
@@ -215,7 +215,8 @@ class _LawSearch:
         if self.motions.sees_states:
             fitted = self.kept.once("classes", lambda: [asdict(law) for law in self._from_states()])
             classes = TypeAdapter(list[LawClass]).validate_python(fitted)
-            scores = [score.error for score in self.scores([law.parameters for law in classes])]
+            laws = [law.parameters for law in classes]
+            scores = [score.error for score in self.scores(laws)]
             smallest = next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
             best = self._enlarged(self._refine(classes[smallest]), classes)
         else:
@@ -417,10 +418,10 @@ class _LawSearch:
             return misfit, first_points(misfit, {name: known[name] for name in bounds})
 
         released = key != _BESIDE and RELEASED in map(self.motions.trials.begin_of, self.train)
-        options = (wanted.max_evaluations, wanted.tolerance, self.kept, "identify_law", key)
-        return refined_searches(prepared, *options, labels=self.motions.labels, released=released)[
-            -1
-        ]
+        searches = Searches(
+            wanted.max_evaluations, wanted.tolerance, self.kept, "identify_law", key
+        )
+        return refined_searches(prepared, searches, self.motions.labels, released)[-1]
 
     @cached_property
     def _bounds_of_others(self) -> dict[str, Bounds]:

@@ -20,7 +20,7 @@ them.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Final
 
 import numpy as np
@@ -202,7 +202,8 @@ def identify_from_tests(
     search = _Search(
         tests, density, poissons_ratio, tuple(f"prony_{float(time)!r}" for time in times), known
     )
-    if unknown := [term for term in terms if not TERMS.fullmatch(term) or term == "c10"]:
+    unknown = [term for term in terms if not TERMS.fullmatch(term) or term == "c10"]
+    if unknown:
         raise InputError(
             f"terms has {unknown[0]!r}: choose from c20, c30, "
             "c01, c02, and ogden_3, ogden_m3 and so on."
@@ -221,7 +222,8 @@ def identify_from_tests(
         )
     for name, test in tests.items():
         test.check(name)
-    groups = [chosen for size in range(_LARGEST_CLASS + 1) for chosen in combinations(terms, size)]
+    sizes = range(_LARGEST_CLASS + 1)
+    groups = [*chain.from_iterable(combinations(terms, size) for size in sizes)]
     lower = [test.lower for test in tests.values()]
     tried, classes = [search.fit(chosen, lower) for chosen in groups], list[TriedClass]()
     for chosen, fit in zip(groups, tried, strict=True):
@@ -448,7 +450,8 @@ class _System:
             slopes.append(np.stack(columns, 1)[chosen] * weights[:, None] * self.scales)
         residuals.append(x[len(self.names) :])
         slopes.append(np.eye(len(x))[len(self.names) :])
-        if (known := self.search.known) is not None:
+        known = self.search.known
+        if known is not None:
             shares = np.array(
                 [shear_modulus({name: 1.0}) for name in self.names] + [0.0] * len(self.of_machines)
             )

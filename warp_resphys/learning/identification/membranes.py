@@ -17,7 +17,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Final
 
 import numpy as np
@@ -91,15 +91,13 @@ class Membrane(Brief):
     def __post_init__(self) -> None:
         """Checks the sizes."""
         for name in ("radius", "thickness", "cap", "force", "ring_modulus", "cell"):
-            if not (math.isfinite(size := getattr(self, name)) and size > 0.0):
+            size = getattr(self, name)
+            if not (math.isfinite(size) and size > 0.0):
                 raise InputError(
                     f"{name} of a membrane is {size:g}: give a positive number, in SI units."
                 )
-        edges = [
-            self.cap,
-            *(edge for r, half in self.rings for edge in (r - half, r + half)),
-            self.radius,
-        ]
+        of_rings = chain.from_iterable((r - half, r + half) for r, half in self.rings)
+        edges = [self.cap, *of_rings, self.radius]
         if any(not low < high for low, high in pairwise(edges)):
             shown = ", ".join(f"{1e3 * edge:.4g}" for edge in edges)
             raise InputError(
@@ -325,7 +323,9 @@ class _Problem:
         """Returns the equilibria at rising heights,
         equally spaced, the first under an increasing force.
         """
-        rest, membrane, first = self.simulator.rest_positions[None], self.membrane, heights[:1]
+        rest = self.simulator.rest_positions[None]
+        membrane = self.membrane
+        first = heights[:1]
         away = (membrane.radius - rest[0, :, :2].norm(dim=1)) / (membrane.radius - membrane.cap)
         q = rest.clone()
         q[..., 2] += heights[0] * away.clamp(0.0, 1.0)

@@ -307,13 +307,12 @@ class Misfit(BoundedMisfit):
         """(S, R, P) one where a motion of `_moves_of` changes a parameter of a trial, else zero."""
         owners = np.zeros((len(self._moves), len(trials.names), len(self.bounds)))
         names = [split_name(name)[1] for name in self.bounds]
-        for number, column in (
-            (number, column) for number, moved in enumerate(self._moves) for column in moved
-        ):
-            owner = names[column]
-            owners[number, :, column] = [
-                not owner or owner in (t, trials.session) for t in trials.names
-            ]
+        for number, moved in enumerate(self._moves):
+            for column in moved:
+                owner = names[column]
+                owners[number, :, column] = [
+                    not owner or owner in (t, trials.session) for t in trials.names
+                ]
         return owners
 
     @property
@@ -406,7 +405,9 @@ class NearbyMotion:
     def keep(self, unit: torch.Tensor, states: Sequence[State]) -> None:
         """Keeps states of the motion with parameters (P,), as fractions of their ranges."""
         small = sum(state.q.nbytes + state.v.nbytes for state in states) <= _MOST_BYTES
-        self._unit, self._states, self._count = unit, states if small else states[:1], len(states)
+        self._unit = unit
+        self._states = states if small else states[:1]
+        self._count = len(states)
 
     def states(self, unit: torch.Tensor) -> Sequence[State] | None:
         """Returns states with parameters (P,), if the last motion had these and they are kept."""

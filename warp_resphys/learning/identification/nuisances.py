@@ -57,11 +57,12 @@ class Nuisances:
         if self.common is None:
             return None
         placements: PlainPlacements = {**self.common.plain(labels)}
-        if named := {
+        named = {
             session: placement.plain(labels)
             for session, placement in self.sessions.items()
             if session
-        }:
+        }
+        if named:
             placements["sessions"] = named
         return placements
 

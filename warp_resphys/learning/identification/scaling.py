@@ -60,7 +60,8 @@ def scale_to_tests(
         raise InputError(
             "a law to be scaled has elastic terms alone, such as c10: take one without branches."
         )
-    if machines := [name for name, test in tests.items() if test.deviations]:
+    machines = [name for name, test in tests.items() if test.deviations]
+    if machines:
         raise InputError(
             f"{machines[0]} has an unknown machine: set its zero, "
             "toe and compliance to 0 to scale a law."
@@ -73,7 +74,9 @@ def scale_to_tests(
         return {**scaled, "bulk_1": bulk_of(scaled, poissons_ratio)}
 
     def linear(x: float) -> Linear:
-        residuals, slopes, found = list[FloatArray](), list[FloatArray](), columns(x)
+        residuals = list[FloatArray]()
+        slopes = list[FloatArray]()
+        found = columns(x)
         for test in tests.values():
             value, by_law, _ = test.response(test.strain, found)
             weights = test.weights * math.sqrt(min(SAMPLES / test.used.sum(), 1.0)) / NOISE

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -106,14 +107,30 @@ class Identification(Identified):
 _PLAIN = TypeAdapter(Identification)
 
 
+@dataclass(frozen=True)
+class Searches:
+    """How searches run that follow one another, and where they are kept.
+
+    Attributes:
+        max_evaluations: see `search_parameters`.
+        tolerance: see `search_parameters`.
+        kept: finished searches.
+        title: of the progress bar.
+        key: of the searches in `kept`.
+        starts: number of starts of the first search.
+    """
+
+    max_evaluations: int
+    tolerance: float
+    kept: Checkpoint
+    title: str
+    key: str = ""
+    starts: int = 1
+
+
 def refined_searches(
     begin: Callable[[Identification | None], tuple[BoundedMisfit, Sequence[Mapping[str, float]]]],
-    max_evaluations: int,
-    tolerance: float,
-    kept: Checkpoint,
-    title: str,
-    key: str = "",
-    starts: int = 1,
+    searches: Searches,
     labels: Sequence[str] = (),
     released: bool = False,
 ) -> list[Identification]:
@@ -124,39 +141,31 @@ def refined_searches(
 
     Args:
         begin: returns the misfit and the starts of the search that follows a result; None at first.
-        max_evaluations: see `search_parameters`.
-        tolerance: see `search_parameters`.
-        kept: finished searches.
-        title: of the progress bar.
-        key: of the searches in `kept`.
-        starts: number of starts of the first search.
+        searches: how they run, and where they are kept.
         labels: see `search_parameters`.
         released: whether the trials begin by a release.
     """
     results, again = list[Identification](), _MOST_AGAIN if released else 0
-    before = [
-        kept.parts[name]["history"]
-        for number in range(1 + again)
-        if (name := f"{key} {number}") in kept.parts
-    ]
-    done = sum(len(records) for history in before for records in history)
-    with Progress(
-        title, (starts + again) * max_evaluations, "evaluations at most", done
-    ) as progress:
+    kept = searches.kept
+    keys = [f"{searches.key} {number}" for number in range(1 + again)]
+    before = [kept.parts[key]["history"] for key in keys if key in kept.parts]
+    done = sum(map(len, chain.from_iterable(before)))
+    most = (searches.starts + again) * searches.max_evaluations
+    with Progress(searches.title, most, "evaluations at most", done) as progress:
 
         def report(start: int, loss: float, values: Mapping[str, float]) -> None:
             name, value = next(iter(values.items()))
             progress.advance(1, start=start, loss=f"{loss:.3g}", **{name: f"{value:.4g}"})
 
-        for number in range(1 + again):
-            ends = partial(_ends, number == again, results[-1].loss if results else None)
+        for key in keys:
+            ends = partial(_ends, key == keys[-1], results[-1].loss if results else None)
 
             def work(ends: IsLast = ends) -> dict[str, Any]:
                 misfit, points = begin(results[-1] if results else None)
-                options = (max_evaluations, tolerance, report, ends, labels)
+                options = (searches.max_evaluations, searches.tolerance, report, ends, labels)
                 return asdict(search_parameters(misfit, points, *options))
 
-            results.append(Identification.from_plain(kept.once(f"{key} {number}", work)))
+            results.append(Identification.from_plain(kept.once(key, work)))
             if ends(results[-1].loss):
                 break
     return results
@@ -233,7 +242,9 @@ def search_parameters(
             f"the simulation failed at every start of the identification: {reason}", None, None
         )
     best = min(good, key=lambda attempt: attempt.loss)
-    unit, misfit.prior_weight, last = best.unit, best.prior_weight, is_last(best.loss)
+    unit = best.unit
+    misfit.prior_weight = best.prior_weight
+    last = is_last(best.loss)
     identified = Identification(
         parameters=misfit.from_unit(unit),
         loss=best.loss,

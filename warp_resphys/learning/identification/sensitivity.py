@@ -11,6 +11,7 @@ did.
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, product
 from typing import Any, TypedDict
 
 import numpy as np
@@ -65,7 +66,7 @@ class Sensitivity:
 def _responses(trials: Trials) -> dict[str, str]:
     """Parameters for a scale and a zero of inputs that drive trials, by name, with their word."""
     driven = [name for name, values in trials.inputs.items() if name not in HUNG and values.any()]
-    return {f"{name}_{word}": word for name in driven for word in ("factor", "zero")}
+    return {f"{name}_{word}": word for name, word in product(driven, ("factor", "zero"))}
 
 
 def sensitivities(
@@ -85,7 +86,9 @@ def sensitivities(
         identified: parameters and their uncertainty.
         batch: largest number of trials that are simulated together; None for all.
     """
-    simulator, found, moved = exact(simulator), dict[str, Sensitivity](), dict[str, float]()
+    simulator = exact(simulator)
+    found = dict[str, Sensitivity]()
+    moved = dict[str, float]()
     for name, word in _responses(motions.trials).items():
         inputs = motions.trials.inputs[name.removesuffix(f"_{word}")]
         moved = {name: 1.0 if word == "factor" else float(np.abs(inputs).max())} | moved
@@ -108,9 +111,8 @@ def sensitivities(
         Progress("Differentiating the test trials", len(names), "trials") as progress,
         torch.no_grad(),
     ):
-        for _, some in (
-            part for whole in motions.trials.batches(names) for part in cut(whole, batch)
-        ):
+        whole = motions.trials.batches(names)
+        for _, some in chain.from_iterable(cut(alike, batch) for alike in whole):
             for shared in in_threads(
                 differentiated, [part for k in range(threads) if (part := some[k::threads])]
             ):
@@ -150,11 +152,11 @@ def _of_batch(
     rows = {parameter: row for row, parameter in enumerate(moved, 1)}
     of_parts = parameters_of_parts(simulator)
     for name in sets:
-        if (parameter := split_name(name)[0]) in moved:
+        parameter = split_name(name)[0]
+        if parameter in moved:
             sets[name][rows[parameter]] += moved[parameter]
-        if (
-            whole := of_parts.get(parameter, ("", 0))[0]
-        ) in moved and whole not in identified.parameters:
+        whole = of_parts.get(parameter, ("", 0))[0]
+        if whole in moved and whole not in identified.parameters:
             # What moves all parts moves each: factors relatively.
             sets[name][rows[whole]] += moved[whole] * (
                 sets[name][0] if whole.endswith("_factor") else 1.0
@@ -217,10 +219,11 @@ def parameter_spread(
                 identified.of_trials_deviation.get(value_name(parameter, owner))
                 for owner in (name, session)
             )
-            if (
-                known := next((value for value in of_trial if value is not None), None)
-            ) is not None:
-                deviation[at], correlation[at], correlation[:, at] = known, 0.0, 0.0
+            known = next((value for value in of_trial if value is not None), None)
+            if known is not None:
+                deviation[at] = known
+                correlation[at] = 0.0
+                correlation[:, at] = 0.0
                 correlation[at, at] = 1.0
         root = deviation[:, None] * _root(correlation, deviation / ranges)
         slopes = np.stack(
@@ -334,11 +337,9 @@ def free_fits(
             continue
         # Trials count alike.
         sizes = [float(np.sqrt(np.nanmean(np.square(errors[name])))) or 1.0 for name in members]
-        scaled = (
-            [x / size for x, size in zip(of, sizes, strict=True)]
-            for of in ([errors[n] for n in members], places)
-        )
-        if (best := _least(*scaled)) is not None:
+        scaled = [errors[n] / size for n, size in zip(members, sizes, strict=True)]
+        best = _least(scaled, [x / size for x, size in zip(places, sizes, strict=True)])
+        if best is not None:
             for name, slopes in zip(members, places, strict=True):
                 left[name]["places"] = mean(errors[name] + slopes @ best)
     return [

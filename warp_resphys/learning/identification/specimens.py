@@ -355,7 +355,8 @@ class MaterialTest(Brief):
                 "specimen with an indenter, or bulge of a membrane."
             )
         for name in ("strain", "stress", "seconds"):
-            if (given := getattr(self, name)) is not None:
+            given = getattr(self, name)
+            if given is not None:
                 values = np.asarray(given, dtype=np.float64)
                 object.__setattr__(self, name, values)
                 if (

@@ -74,7 +74,9 @@ class WeakForm:
                 "there is no step to balance: give at least one motion, "
                 "and a stride of one or more."
             )
-        self._simulator, self._zero, self._stride = simulator, dict(zero), stride
+        self._simulator = simulator
+        self._zero = dict(zero)
+        self._stride = stride
         self._slow = replace(simulator, time_step=weight_step)
         self._stiff = self._slow.prepare(stiffness)
         self._motions = motions
@@ -121,12 +123,10 @@ class WeakForm:
         values = {
             name: [c.get(name, self._zero.get(name, 0.0)) for c in candidates] for name in names
         }
+        series = {name: [value] * count for name, value in self._zero.items()} | values
         spread = {
-            name: motion.q.new_tensor(series).repeat_interleave(batch)[:, None]
-            for name, series in {
-                **{k: [x] * count for k, x in self._zero.items()},
-                **values,
-            }.items()
+            name: motion.q.new_tensor(x).repeat_interleave(batch)[:, None]
+            for name, x in series.items()
         }
         constants = simulator.prepare(spread)
         carries = True

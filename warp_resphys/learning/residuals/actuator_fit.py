@@ -23,6 +23,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any, Final
 
 import torch
@@ -190,7 +191,7 @@ class ActuatorFitting:
             f"{name}: held out", len(folds) * settings.epochs, "epochs at most"
         ) as progress:
             epochs, (below, errors) = cross_validated_epochs(trainers, progress.advance)
-        names = [one for fold in folds for one in self._in_batches(fold)]
+        names = [*chain.from_iterable(map(self._in_batches, folds))]
         return epochs, self._tested(names, HELD_OUT, errors, below)
 
     def _trainer(
@@ -205,9 +206,7 @@ class ActuatorFitting:
         felt = [felt_inputs(replay, values, settings.filters) for replay, _ in replays]
         return LinearisedTrainer(
             _untrained(felt, settings),
-            replays,
-            felt,
-            values,
+            FeltMotions(replays, felt, values),
             self._loss_of(replays),
             self._loss(judged),
             settings,
@@ -216,7 +215,7 @@ class ActuatorFitting:
 
     def _in_batches(self, names: Sequence[str]) -> list[str]:
         """Names of trials in the order of their batches, which is that of their errors."""
-        return [name for batch in self.motions.trials.batches(names) for name in batch]
+        return [*chain.from_iterable(self.motions.trials.batches(names))]
 
     def _tested(
         self,
@@ -254,6 +253,26 @@ class ActuatorFitting:
         return [(self.motions.learned(replay), start) for replay, start in replays]
 
 
+@dataclass(frozen=True)
+class FeltMotions:
+    """Motions to learn from, with what the networks take in each.
+
+    Attributes:
+        replays: of the trials, each with its start.
+        felt: what the networks take in each, see `felt_inputs`.
+        values: (1,) identified parameters.
+    """
+
+    replays: Sequence[tuple[Replay, Start]]
+    felt: Sequence[Mapping[str, torch.Tensor]]
+    values: Mapping[str, torch.Tensor]
+
+    def linearised(self, model: Actuator) -> list[Linearised]:
+        """Returns the motions, linearised about those with an actuator."""
+        pairs = zip(self.replays, self.felt, strict=True)
+        return [Linearised.of(*pair, self.values, model, felt) for pair, felt in pairs]
+
+
 class LinearisedTrainer(JudgedTrainer[Actuator]):
     """Fits an actuator to linearised motions, which an epoch linearises again.
 
@@ -261,9 +280,7 @@ class LinearisedTrainer(JudgedTrainer[Actuator]):
 
     Args:
         model: to train.
-        replays: of the trials to learn from, each with its start.
-        felt: what the networks take in each, see `felt_inputs`.
-        values: (1,) identified parameters.
+        motions: to learn from.
         train: loss of these trials.
         judge: loss whose error selects the weights.
         settings: epochs and patience.
@@ -273,16 +290,15 @@ class LinearisedTrainer(JudgedTrainer[Actuator]):
     def __init__(
         self,
         model: Actuator,
-        replays: Sequence[tuple[Replay, Start]],
-        felt: Sequence[Mapping[str, torch.Tensor]],
-        values: Mapping[str, torch.Tensor],
+        motions: FeltMotions,
         train: MotionLoss,
         judge: MotionLoss,
         settings: ActuatorSettings,
         epochs: int | None = None,
     ) -> None:
         super().__init__(model, None, train, judge, settings, epochs)
-        self._replays, self._felt, self._values, self._near = replays, felt, values, list(_NEAR)
+        self._motions = motions
+        self._near = list(_NEAR)
 
     @property
     @override
@@ -299,11 +315,8 @@ class LinearisedTrainer(JudgedTrainer[Actuator]):
         before = copy.deepcopy(self.model.network.state_dict())
         if not self._near:
             return {"train_loss": least}
-        pairs = zip(self._replays, self._felt, strict=True)
         try:
-            linearised = [
-                Linearised.of(*pair, self._values, self.model, felt) for pair, felt in pairs
-            ]
+            linearised = self._motions.linearised(self.model)
         except ConvergenceError as error:
             log.info("the actuator stays as it is: %s", error)
             self._near.clear()

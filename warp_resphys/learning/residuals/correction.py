@@ -79,7 +79,9 @@ class CorrectedSimulator:
 
     def _advance(self, state: State, number: int, lost: torch.Tensor) -> tuple[State, torch.Tensor]:
         """Returns the next state, and which environments (B,) failed."""
-        inputs, force, failed = self._inputs.at(number), None, lost
+        inputs = self._inputs.at(number)
+        force = None
+        failed = lost
         if self._predict is not None:
             predicted = self._predict(state, number)
             if isinstance(predicted, State):
@@ -234,13 +236,11 @@ class LearnedPredictor:
         frames: VertexFrames | None = None,
         base: BaseFrame | None = None,
     ) -> None:
-        self.model, self._context, self._range, self._frames, self._base = (
-            model,
-            context,
-            range_,
-            frames,
-            base,
-        )
+        self.model = model
+        self._context = context
+        self._range = range_
+        self._frames = frames
+        self._base = base
         self.left_at: torch.Tensor | None = None
         self.acts = model.acts
 
@@ -248,7 +248,8 @@ class LearnedPredictor:
         """Returns the model's force (B, N, 3) [N] or next state,
         on the simulator's device and in its precision.
         """
-        q, v, like = state.q, state.v, self.model.rest
+        q, v = state.q, state.v
+        like = self.model.rest
         if self._base is not None:
             q, v = self._base.enter(q, v, step)
         context, weight = self._context, None

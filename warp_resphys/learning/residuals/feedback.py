@@ -107,7 +107,9 @@ class _Feedback:
         constants: Constants,
         predict: Callable[[State, int], Any],
     ) -> None:
-        self._simulator, self._inputs, self._constants = simulator, inputs, constants
+        self._simulator = simulator
+        self._inputs = inputs
+        self._constants = constants
         self._predict, self._acts = predict, acts_of(predict)
         self._aim = _AIMS[simulator.dtype]
 

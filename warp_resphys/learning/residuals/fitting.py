@@ -7,6 +7,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any
 
 import torch
@@ -212,7 +213,9 @@ class Fitting:
                 "reconstruct them first."
             )
         arrays = self.reconstructed.of(names, "q", "v", "force", "error")
-        if (given := arrays[0].shape[2]) != (wanted := len(self.simulator.rest_positions)):
+        given = arrays[0].shape[2]
+        wanted = len(self.simulator.rest_positions)
+        if given != wanted:
             raise InputError(
                 f"forces on {given} vertices were reconstructed, "
                 f"but the body has {wanted}: do so for it."
@@ -348,7 +351,7 @@ class Fitting:
                 f"{name}: held out", len(train) * loop.epochs, "epochs at most"
             ) as progress:
                 epochs, (below, errors) = cross_validated_epochs(parts, progress.advance)
-            sizes = [size for part in parts for size in part.judge.amplitudes_mm()]
+            sizes = [*chain.from_iterable(part.judge.amplitudes_mm() for part in parts)]
             test = (
                 held_out_test(train, HELD_OUT, errors, below, sizes)
                 if settings.trainer.gate

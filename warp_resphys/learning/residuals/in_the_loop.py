@@ -14,6 +14,7 @@ uncorrected simulator, and a penalty on the weights keeps it there as far as the
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, TypeVar
 
 import numpy as np
@@ -66,7 +67,9 @@ class MotionLoss:
     def __init__(
         self, groups: Sequence[TrialGroup], parameters: Mapping[str, torch.Tensor]
     ) -> None:
-        self._groups, self._parameters, self.judged = groups, parameters, list[list[FloatArray]]()
+        self._groups = groups
+        self._parameters = parameters
+        self.judged = list[list[FloatArray]]()
         counts = [len(group.replay.trials.names) for group in groups]
         shares = [count / sum(counts) for count in counts]
         self.weights = [
@@ -99,8 +102,8 @@ class MotionLoss:
         """Returns the loss, differentiable in the model's weights."""
         pairs = zip(self._errors(model), self.weights, strict=True)
         squares = [
-            (sum(x.square().sum((1, 2, 3)) for x in errors) * weight).sum()
-            for errors, weight in pairs
+            ((of_points.square().sum((1, 2, 3)) + of_loads.square().sum((1, 2, 3))) * weight).sum()
+            for (of_points, of_loads), weight in pairs
         ]
         return torch.stack(squares).sum()
 
@@ -116,22 +119,18 @@ class MotionLoss:
             with torch.no_grad():
                 distances = [errors.norm(dim=-1) for errors, _ in self._errors(model)]
         except ConvergenceError:
-            self.judged.append([np.full(1, np.nan) for one in seen for _ in one])
+            self.judged.append([np.full(1, np.nan) for _ in range(sum(map(len, seen)))])
             return float("inf")
         pairs = [*zip(distances, seen, strict=True)]
-        frames = [
-            (row.sum(1) / s.sum(1))[s.any(1)]
-            for d, shown in pairs
-            for row, s in zip(d, shown, strict=True)
-        ]
+        rows = zip(chain.from_iterable(distances), chain.from_iterable(seen), strict=True)
+        frames = [(row.sum(1) / s.sum(1))[s.any(1)] for row, s in rows]
         self.judged.append([1e3 * row.double().cpu().numpy() for row in frames])
         return 1e3 * float(torch.cat([d.sum((1, 2)) / s.sum((1, 2)) for d, s in pairs]).mean())
 
     def amplitudes_mm(self) -> list[float]:
         """Amplitudes of the trials [mm]."""
-        return [
-            1e3 * size for group in self._groups for size in group.replay.trials.amplitude.tolist()
-        ]
+        sizes = (group.replay.trials.amplitude.tolist() for group in self._groups)
+        return [1e3 * size for size in chain.from_iterable(sizes)]
 
 
 class JudgedTrainer(EpochTrainer[Corrected]):
@@ -283,10 +282,9 @@ def cross_validated_epochs(
             or len(means) - 1 - best >= trainers[0].settings.patience
         ):
             judged = [trainer.judge.judged[-len(means) :] for trainer in trainers]
-            before, after = (
-                [row for of_part in judged for row in of_part[epoch]] for epoch in (0, best)
-            )
-            return best, (before, after)
+            before = chain.from_iterable(of_part[0] for of_part in judged)
+            after = chain.from_iterable(of_part[best] for of_part in judged)
+            return best, ([*before], [*after])
         for trainer in trainers:
             trainer.run_epoch()
             advance()

@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Final
 
 import torch
@@ -59,7 +60,7 @@ class Linearised:
         replay = replay.changed(actuator=model.inputs)
         states, prepared = replay.states(start, parameters), replay.prepare(parameters)
         sizes = {name: _CHANGE * network.unit for name, network in model.inputs.items()}
-        columns = [name for name in sizes for _ in range(model.inputs[name].parts)]
+        columns = [*chain.from_iterable([name] * model.inputs[name].parts for name in sizes)]
         # The derivatives by lasting changes have no transients then.
         settles = start.at_rest and not replay.is_static
         random = _random_changes(prepared[1], sizes, replay.simulator.time_step) if settles else {}
@@ -194,7 +195,9 @@ def chosen_penalty(
         loss_weights: (R,) of the squared errors of each group's trials.
         model: to fit.
     """
-    begin, best, least = copy.deepcopy(model.state_dict()), _PENALTIES[0], math.inf
+    begin = copy.deepcopy(model.state_dict())
+    best = _PENALTIES[0]
+    least = math.inf
     trials = torch.cat([torch.full_like(weights, 1.0) for weights in loss_weights]).cumsum(0) - 1.0
     folds = [trials % _FOLDS == number for number in range(min(_FOLDS, len(trials)))]
     fitted = [begin for _ in folds]

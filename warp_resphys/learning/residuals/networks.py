@@ -139,7 +139,9 @@ class StateMap(nn.Module):
     ) -> None:
         super().__init__()
         self.register_buffer("rest", rest)
-        self.position, self.velocity, self.actuation = position, velocity, actuation
+        self.position = position
+        self.velocity = velocity
+        self.actuation = actuation
         self.outputs = nn.ModuleDict(outputs)
         self.acts: Acts = architecture.acts
         keys = (*_ARCHITECTURE, *(("core",) if architecture.core else ()))

@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from typing import Any, Final, Self
 
 import numpy as np
@@ -72,7 +72,9 @@ class Reconstructor(ABC):
         observation: Observation,
         acts: Acts,
     ) -> None:
-        self.simulator, self.settings, self.acts = simulator, settings, acts
+        self.simulator = simulator
+        self.settings = settings
+        self.acts = acts
         self.regularisation = settings.regularisation
         self.observation = observation.to(simulator.rest_positions)
         if not isinstance(observation, WholeState):
@@ -204,7 +206,9 @@ class LBFGSB(Reconstructor):
         first_guess: torch.Tensor | None = None,
         read: Read | None = None,
     ) -> ReconstructedStep:
-        sim, like, acting = self.simulator, state.q, inputs or Inputs()
+        sim = self.simulator
+        like = state.q
+        acting = inputs or Inputs()
         free = sim.rest_positions.new_ones(sim.body.n_vertices, 1)
         free[sim.fixed] = 0.0
         whole = isinstance(self.observation, WholeState)
@@ -345,7 +349,8 @@ class ReconstructedTrials(Brief):
         Raises:
             InputError: a trial was not reconstructed.
         """
-        if missing := [name for name in names if name not in self.names]:
+        missing = [name for name in names if name not in self.names]
+        if missing:
             raise InputError(
                 f"the trial {missing[0]!r} was not reconstructed: there are "
                 f"{', '.join(self.names)}."
@@ -394,9 +399,8 @@ def reconstruct(
             work = partial(_reconstructed, used, motions, batch, known, wanted, acts)
             cut_up.append(TrialPart(f"part{number}_{first:03d}", batch, frames, work))
     parts.run(cut_up)
-    return ReconstructedTrials(
-        tuple(name for part in cut_up for name in part.names), partial(parts.joined, cut_up)
-    )
+    order = chain.from_iterable(part.names for part in cut_up)
+    return ReconstructedTrials(tuple(order), partial(parts.joined, cut_up))
 
 
 def _reconstructed(

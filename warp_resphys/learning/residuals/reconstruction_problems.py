@@ -4,6 +4,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import ClassVar
 
 import torch
@@ -154,7 +155,9 @@ class FullStateProblem(StepProblem):
 
     @override
     def linearise(self, point: Point) -> Move:
-        step, weight, x, (force,) = self._step, self._weight, point.x, point.kept
+        step, weight = self._step, self._weight
+        x = point.x
+        (force,) = point.kept
         short = _SHORT * self.tolerance
         step.update(x)
         right = self._target - x - weight * step.product(force)
@@ -305,7 +308,8 @@ def load_reader(
         InputError: the zero is unknown, and the motion does not begin in equilibrium; or all
             vertices are observed.
     """
-    if not (sensors := replay.trials.sensors):
+    sensors = replay.trials.sensors
+    if not sensors:
         return None
     if isinstance(replay.observe, WholeState):
         raise InputError(
@@ -328,7 +332,8 @@ def load_reader(
             off = torch.nan if replay.is_static else loads[:, 0, number] - first
             loads[:, :, number] -= off if isinstance(off, float) else off[:, None]
     trials = replace(replay.trials, sensors=tuple(replace(sensor, zero=0.0) for sensor in sensors))
-    measured = [math.isfinite(deviation) for sensor in sensors for deviation in sensor.deviations]
+    deviations = chain.from_iterable(sensor.deviations for sensor in sensors)
+    measured = [*map(math.isfinite, deviations)]
 
     def read(before: State, after: State, number: int) -> torch.Tensor:
         now = 0 if replay.is_static else number + 1

@@ -76,9 +76,15 @@ class EpochTrainer(ABC, Generic[Trained]):
         rollout_error: Callable[[Trained], float],
         settings: EpochSettings,
     ) -> None:
-        self.model, self.settings, self.rollout_error = model, settings, rollout_error
-        self._optimiser, self.epoch, self.history = optimiser, 0, list[dict[str, float]]()
-        self.best_score, self.best_epoch, self.best = math.inf, 0, dict[str, torch.Tensor]()
+        self.model = model
+        self.settings = settings
+        self.rollout_error = rollout_error
+        self._optimiser = optimiser
+        self.epoch = 0
+        self.history = list[dict[str, float]]()
+        self.best_score = math.inf
+        self.best_epoch = 0
+        self.best = dict[str, torch.Tensor]()
 
     @abstractmethod
     def _run_epoch(self) -> dict[str, float]:

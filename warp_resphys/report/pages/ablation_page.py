@@ -80,7 +80,8 @@ def write_ablation_report(
         f"simulation is {number_text(uncorrected)}{NO_BREAK_SPACE}mm off on average. The sets "
         f"are drawn from the {free} surface vertices that are not clamped."
     )
-    if more := [str(row.markers) for row in rows if row.markers > free]:
+    more = [str(row.markers) for row in rows if row.markers > free]
+    if more:
         note += (
             f" Sets of {', '.join(more)} markers exceed these, and are drawn from all {surface} "
             "surface vertices, as published."

@@ -80,11 +80,8 @@ def specimen_table(metrics: MaterialMetrics) -> PageTable:
 
 def _models(metrics: MaterialMetrics) -> list[str]:
     """Returns the models of the tests, in their order."""
-    return [
-        model
-        for model in _MODELS
-        if any(model in one["errors"]["range"] for one in metrics["tests"].values())
-    ]
+    known = set[str]().union(*(one["errors"]["range"] for one in metrics["tests"].values()))
+    return [model for model in _MODELS if model in known]
 
 
 def material_verdict(metrics: MaterialMetrics, law: LawContent, run: RunSettings) -> list[str]:
@@ -97,7 +94,8 @@ def material_verdict(metrics: MaterialMetrics, law: LawContent, run: RunSettings
         [*terms, *([f"{branches} relaxing branch{'es' * (branches > 1)}"] if branches else [])]
     )
     notes = metrics.get("left_out", [])
-    if (factor := metrics.get("factor")) is not None:
+    factor = metrics.get("factor")
+    if factor is not None:
         return [*_scaled_verdict(metrics, factor), *notes]
     shown = {part: _mean(metrics, part) for part in _PARTS}
     part = "beyond" if shown["beyond"]["law"] is not None else "range"
@@ -141,7 +139,8 @@ def _scaled_verdict(metrics: MaterialMetrics, factor: float) -> list[str]:
             f"It predicts {len(known)} tests that it was not scaled to with an error of "
             f"{_percent(mean)} %, at most {_percent(known[worst])} % ({worst})."
         )
-    if lost := [name for name in held if name not in known]:
+    lost = [name for name in held if name not in known]
+    if lost:
         said.append(f"It has no equilibrium in {in_a_row(lost)}: give data.range lower heights.")
     return said
 
@@ -207,25 +206,24 @@ def draw_curves(tests: Mapping[str, SpecimenResult], canvas: Canvas) -> Drawn:
     for axis, (name, result) in zip(axes, tests.items(), strict=False):
         shown = 100.0 * np.array(result["shown"])
         axis.plot(
-            *(100.0 * np.array(result["strain"]), 1e-3 * np.array(result["stress"])),
-            **{
-                "linestyle": "",
-                "marker": ".",
-                "markersize": 3.0,
-                "color": TONES["ink"].light,
-                "label": "measured",
-            },
+            100.0 * np.array(result["strain"]),
+            1e-3 * np.array(result["stress"]),
+            linestyle="",
+            marker=".",
+            markersize=3.0,
+            color=TONES["ink"].light,
+            label="measured",
         )
-        if (law := _in_kilopascals(result["curves"]["law"])) is not None and result[
-            "half_width"
-        ] is not None:
+        law = _in_kilopascals(result["curves"]["law"])
+        if law is not None and result["half_width"] is not None:
             half = 1e-3 * np.array(result["half_width"])
             band: dict[str, Any] = {"color": TONES["law"].light, "alpha": 0.18, "linewidth": 0.0}
             axis.fill_between(shown, law - half, law + half, **band, label="90 % interval")
         if law is not None:
             axis.plot(shown, law, color=TONES["law"].light, linewidth=1.8, label="law")
         for model, style in _STYLES.items():
-            if (values := _in_kilopascals(result["curves"].get(model))) is not None:
+            values = _in_kilopascals(result["curves"].get(model))
+            if values is not None:
                 line: dict[str, Any] = {
                     "color": TONES["muted"].light,
                     "linewidth": 1.1,
@@ -304,21 +302,17 @@ def _machines(metrics: MaterialMetrics) -> list[Block]:
         "toe": ("%", 100.0),
         "compliance": ("% of the length per MPa", 1e8),
     }
-    names = [
-        name for name in units if any(name in machine for machine in metrics["machines"].values())
-    ]
+    known = set[str]().union(*metrics["machines"].values())
+    names = [name for name in units if name in known]
     if not names:
         return []
-    rows = [
-        Row(
-            test,
-            [
-                Cell(significant(units[name][1] * machine[name], 3) if name in machine else NONE)
-                for name in names
-            ],
-        )
-        for test, machine in metrics["machines"].items()
-    ]
+    rows = []
+    for test, machine in metrics["machines"].items():
+        cells = [
+            Cell(significant(units[name][1] * machine[name], 3) if name in machine else NONE)
+            for name in names
+        ]
+        rows.append(Row(test, cells))
     return [
         PageTable("Machine", [f"{name.capitalize()} [{units[name][0]}]" for name in names], rows)
     ]

@@ -1,6 +1,7 @@
 """The page of a run, of a fold or over folds: the errors, then sections on its other results."""
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -139,9 +140,9 @@ def _what_is_measured(data: RunReport) -> str:
 def _contributions(metrics: Metrics) -> list[str]:
     """Sentences on how bodies were held, and on the contribution of noise to errors, if known."""
     notes = []
-    if sideways := {
-        trial: mm for fold in folds_in(metrics) for trial, mm in fold.get("sideways_mm", {}).items()
-    }:
+    of_folds = (fold.get("sideways_mm", {}) for fold in folds_in(metrics))
+    sideways = dict(chain.from_iterable(of_fold.items() for of_fold in of_folds))
+    if sideways:
         distances = ", ".join(
             f"{mm_text(distance)} ({trial})" for trial, distance in sideways.items()
         )

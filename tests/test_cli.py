@@ -17,7 +17,6 @@ from typing import Any
 import hydra
 import pytest
 from hydra import compose, initialize_config_module
-from hydra._internal.utils import get_args_parser
 from omegaconf import OmegaConf
 from pydantic import ConfigDict
 
@@ -363,15 +362,22 @@ class TestCommands:
         )
         assert len(calls) == 2
 
-    def test_options_with_a_value_are_those_of_hydra(self):
-        actions = get_args_parser()._actions
-        valued = {
-            name
-            for action in actions
-            if action.nargs in (None, "?")
-            for name in action.option_strings
-        }
-        assert set(commands.VALUED) == valued
+    def test_options_with_a_value_are_those_of_hydra(self, command):
+        code, usage = command("--unknown")
+        valued = re.findall(r"\[(--[a-z-]+) [A-Z{[]", usage)
+        assert (code, valued) == (2, [names[0] for names in commands.OPTIONS_WITH_VALUE])
+        explained = outcome("--hydra-help").out
+        for names in commands.OPTIONS_WITH_VALUE:
+            assert f"\n{','.join(names)} : " in explained
+
+    def test_options_and_overrides_come_in_any_order(self, command):
+        seeds = []
+        command.job = lambda config: seeds.append(config["seed"])
+        assert command("-m", "seed=1,2", "--config-name=config", "name=a", "--run")[0] == 2
+        assert command("seed=1,2", "-m", "name=a", "--config-name=config") == (0, "")
+        assert seeds == [1, 2]
+        assert "Config search path" in outcome("seed=1", "--info", "searchpath").out
+        assert "Defaults List" in outcome("--info", "--config-name=check").out
 
 
 _OWN = {"my_robot", "my_arm", "ecoflex", "--cfg"}  # experiments that the reader writes

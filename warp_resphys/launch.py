@@ -44,7 +44,7 @@ from .io.atomic import is_disk_full
 from .io.errors import ResphysError, ResphysWarning, did_you_mean
 from .io.process import collector_paused, ends_as_after_ctrl_c
 from .io.settings import Settings, parse
-from .option_files import names_are_texts, run_schema
+from .option_files import own_options, run_schema, search_path_read_here
 from .overrides import LateOverride, adjust, readable
 from .settings.run import RunSettings
 
@@ -96,7 +96,7 @@ class _Job:
 
     def run(self, command: str, arguments: Sequence[str]) -> None:
         """Composes the configuration and runs the command with it."""
-        options, flags = _options([*_user_options(), *arguments])
+        options, flags = _options(arguments)
         if options.pop("experimental_rerun", None) is not None:
             raise HydraException(
                 "--experimental-rerun reads a pickle, which can run code: use overrides instead"
@@ -104,6 +104,7 @@ class _Job:
         if command in TYPED and options.get("cfg") == "job":
             del options["cfg"]
             self.shown = options.pop("package", "")
+        folder = options.pop("config_dir", _user_folder())
         overrides = options.pop("overrides")
         if overrides:
             schema = (
@@ -111,9 +112,8 @@ class _Job:
                 if command in TYPED
                 else _function(self.function)[1].model_json_schema()
             )
-            overrides, self.late = readable(
-                overrides, schema, options.get("config_dir"), "--multirun" in flags
-            )
+            words, self.late = readable(overrides, schema, folder, "--multirun" in flags)
+            overrides = [search_path_read_here(word) for word in words]
         overrides += _SILENT if self.shown is not None else ()
         flags += [f"--{name.replace('_', '-')}={value}" for name, value in options.items()]
         OmegaConf.register_new_resolver("run_label", self._label, replace=True)
@@ -124,7 +124,7 @@ class _Job:
         )(self._call)
         typed, sys.argv = sys.argv, [*sys.argv[:1], *flags, *overrides]
         try:
-            with ends_as_after_ctrl_c(), names_are_texts():
+            with ends_as_after_ctrl_c(), own_options(folder):
                 job()
         finally:
             sys.argv = typed
@@ -217,8 +217,8 @@ def _options(arguments: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
     """Options of Hydra that have a value, with ``overrides``, and the flags that have none."""
     parser = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
     for name, *short in OPTIONS_WITH_VALUE:
-        needs = {"nargs": "?", "const": "all"} if name == "--info" else {}
-        parser.add_argument(name, *short, **needs)
+        optional: dict[str, Any] = {"nargs": "?", "const": "all"} if name == "--info" else {}
+        parser.add_argument(name, *short, **optional)
     parser.add_argument("--multirun", "-m", action="store_true")
     parser.add_argument("overrides", nargs="*", default=[])
     known, flags = parser.parse_known_intermixed_args(arguments)
@@ -226,14 +226,11 @@ def _options(arguments: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
     return options, [*flags, *["--multirun"][: options.pop("multirun", False)]]
 
 
-def _user_options() -> list[str]:
-    """Arguments that add the folder of the user's own options, if it exists.
-
-    A later --config-dir replaces it.
-    """
+def _user_folder() -> str | None:
+    """The folder of the user's own options in the working directory, if it exists."""
     folder = Path.cwd() / OWN_OPTIONS
     if not folder.is_dir():
-        return []
+        return None
     packaged = resources.files(CONFIG_PACKAGE)
     for path in sorted(folder.glob("*/*.yaml")):
         name = path.relative_to(Path.cwd())
@@ -242,7 +239,7 @@ def _user_options() -> list[str]:
                 f"warning: {name} is ignored: the package has an option of that name",
                 file=sys.stderr,
             )
-    return ["--config-dir", str(folder)]
+    return str(folder)
 
 
 def _show(config: DictConfig, key: str) -> None:

@@ -15,10 +15,7 @@ from typing import Any
 import pytest
 import torch
 import warp as wp
-from hydra._internal import defaults_list
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.hydra import Hydra
-from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigSource
 
@@ -151,9 +148,16 @@ def _configurations_are_read_once():
     Hydra does not compose a configuration twice, the first time to read `hydra.mode`, which nothing
     here sets.
     """
-    Plugins.instance()  # imports the classes of the sources anew
-    source, kept = SourcesRegistry.instance().resolve("pkg"), {}
-    load = source.load_config
+    initialize = GlobalHydra.initialize
+
+    def without_mode(self: GlobalHydra, hydra: Any) -> None:
+        hydra.get_mode = lambda **_: None
+        initialize(self, hydra)
+
+    sources = [
+        source for source in Plugins.instance().discover(ConfigSource) if source.scheme() == "pkg"
+    ]
+    kept, load = {}, sources[0].load_config
 
     def read(self: ConfigSource, config_path: str) -> Any:
         if (place := (self.path, config_path)) not in kept:
@@ -161,56 +165,14 @@ def _configurations_are_read_once():
         return deepcopy(kept[place])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(source, "load_config", read)
-        patch.setattr(Hydra, "get_mode", lambda *_, **__: None)
+        patch.setattr(GlobalHydra, "initialize", without_mode)
+        for source in sources:
+            patch.setattr(source, "load_config", read)
         patch.setattr(
             Settings,
             "model_json_schema",
             classmethod(functools.cache(Settings.model_json_schema.__func__)),
         )
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _options_are_composed_once():
-    """What Hydra makes of the same options of the same files, before it sets single keys.
-
-    A copy for each test.
-    """
-    list_defaults = defaults_list._create_defaults_list
-    compose = ConfigLoaderImpl._compose_config_from_defaults_list
-    listed: dict[str, Any] = {}
-    configs: dict[str, Any] = {}
-
-    def sources(repo: Any) -> list[Any]:
-        """The places of options, and the texts of those outside of packages."""
-        found: list[Any] = []
-        for source in repo.get_sources():
-            found.append(f"{source.scheme()}://{source.path}")
-            if source.scheme() == "file":
-                found += [
-                    (str(path), path.read_bytes())
-                    for path in sorted(Path(source.path).rglob("*.yaml"))
-                ]
-        return found
-
-    def list_once(repo: Any, name: str | None, overrides: Any, **options: bool) -> Any:
-        single, chosen = overrides.config_overrides, {**vars(overrides), "config_overrides": None}
-        if (key := repr((sources(repo), name, chosen, options))) not in listed:
-            found = list_defaults(repo, name, overrides, **options)
-            listed[key] = deepcopy((found, {**vars(overrides), "config_overrides": None}))
-        found, known = deepcopy(listed[key])
-        vars(overrides).update(known, config_overrides=single)
-        return found
-
-    def compose_once(self: ConfigLoaderImpl, defaults: Any, repo: Any) -> Any:
-        if (key := repr((sources(repo), defaults))) not in configs:
-            configs[key] = compose(self, defaults, repo)
-        return deepcopy(configs[key])
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(defaults_list, "_create_defaults_list", list_once)
-        patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", compose_once)
         yield
 
 

@@ -17,7 +17,6 @@ from typing import Any
 import hydra
 import pytest
 from hydra import compose, initialize_config_module
-from hydra._internal.utils import get_args_parser
 from omegaconf import OmegaConf
 from pydantic import ConfigDict
 
@@ -178,6 +177,11 @@ class TestOwnOptions:
         assert err == ""
         assert command("--config-dir", "elsewhere", "experiment=other_robot") == (0, "")
         assert command("--config-dir", "elsewhere", "experiment=my_robot")[0] == 2
+
+    def test_names_are_texts_in_the_folder_of_another_main_configuration(self, command, config_dir):
+        (config_dir / "experiment/octal.yaml").write_text("# @package _global_\nname: 010")
+        assert command("experiment=octal") == (0, "")
+        assert command.outputs == ["runs/010/default"]
 
     def test_the_package_wins_and_says_so(self, command, own):
         (own / "config.yaml").write_text("name: of something else")
@@ -363,15 +367,22 @@ class TestCommands:
         )
         assert len(calls) == 2
 
-    def test_options_with_a_value_are_those_of_hydra(self):
-        actions = get_args_parser()._actions
-        valued = {
-            name
-            for action in actions
-            if action.nargs in (None, "?")
-            for name in action.option_strings
-        }
-        assert set(commands.VALUED) == valued
+    def test_options_with_a_value_are_those_of_hydra(self, command):
+        code, usage = command("--unknown")
+        valued = re.findall(r"\[(--[a-z-]+) [A-Z{[]", usage)
+        assert (code, {*valued}) == (2, {names[0] for names in commands.OPTIONS_WITH_VALUE})
+        explained = outcome("--hydra-help").out
+        for names in commands.OPTIONS_WITH_VALUE:
+            assert f"\n{','.join(names)} : " in explained
+
+    def test_options_and_overrides_come_in_any_order(self, command):
+        seeds = []
+        command.job = lambda config: seeds.append(config["seed"])
+        assert command("-m", "seed=1,2", "--config-name=config", "name=a", "--run")[0] == 2
+        assert command("seed=1,2", "-m", "name=a", "--config-name=config") == (0, "")
+        assert seeds == [1, 2]
+        assert "Config search path" in outcome("seed=1", "--info", "searchpath").out
+        assert "Defaults List" in outcome("--info", "--config-name=check").out
 
 
 _OWN = {"my_robot", "my_arm", "ecoflex", "--cfg"}  # experiments that the reader writes

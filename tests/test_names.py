@@ -167,6 +167,16 @@ class TestFiles:
         )
         assert markers["register_with"] == ["1", "no"]
 
+    @pytest.mark.parametrize("scheme", ["file://", ""])
+    def test_they_are_in_every_folder_on_the_search_path(self, folder, scheme):
+        for place, name in (("a b", "own"), ("other", "more")):
+            path = folder / place / "experiment" / f"{name}.yaml"
+            path.parent.mkdir(parents=True)
+            path.write_text("# @package _global_\ndefaults: [beam_real, _self_]\ntitle: 010\n")
+        places = f"hydra.searchpath=[{scheme}{folder}/a b,'{scheme}{folder}/other']"
+        for name in ("own", "more"):
+            assert shown(places, f"experiment={name}")["title"] == "010"
+
     def test_a_group_replaces_that_of_another_experiment(self, own):
         base = (
             "defaults: [beam_real, _self_]\nmarkers: {reference: {_replace_: true, a: [0, 0, 1], "

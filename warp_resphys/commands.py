@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
@@ -103,20 +104,17 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
     }
 )
 
-# Hydra's options whose next word is their value.
-VALUED: Final = (
-    "--cfg",
-    "-c",
-    "--package",
-    "-p",
-    "--config-path",
-    "-cp",
-    "--config-name",
-    "-cn",
-    "--config-dir",
-    "-cd",
-    *("--info", "-i", "--experimental-rerun"),
+# Names of Hydra's options whose next word is their value.
+OPTIONS_WITH_VALUE: Final = (
+    ("--cfg", "-c"),
+    ("--package", "-p"),
+    ("--config-path", "-cp"),
+    ("--config-name", "-cn"),
+    ("--config-dir", "-cd"),
+    ("--info", "-i"),
+    ("--experimental-rerun",),
 )
+_VALUED: Final = frozenset(chain.from_iterable(OPTIONS_WITH_VALUE))
 _LABEL_LENGTH: Final = 100
 _OPTIONS: Final = """\
 --cfg job         show all keys and their values, for these settings
@@ -156,7 +154,7 @@ def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
             for at in range(named[-1] + 1, len(rest))
             if os.path.exists(rest[at]) or _is_path(rest[at])
         ]
-        words = sorted({*words, *(at for at in files if rest[at - 1] not in VALUED)})
+        words = sorted({*words, *(at for at in files if rest[at - 1] not in _VALUED)})
     after = [at for at in words if at not in named]
     dropped, quoted = set(named), [quote_name(rest[at]) for at in after]
     if command.word and after:
@@ -169,7 +167,7 @@ def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
 
 def _is_word(argument: str, before: str) -> bool:
     """Whether an argument is a word: no option, no value of one, and no override."""
-    return "=" not in argument and argument[:1] not in ("-", "+", "~") and before not in VALUED
+    return "=" not in argument and argument[:1] not in ("-", "+", "~") and before not in _VALUED
 
 
 def _is_path(argument: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import gc
 import logging
 import os
@@ -16,7 +17,7 @@ from importlib import import_module, resources
 from pathlib import Path
 from typing import Any, Final, get_type_hints
 
-from hydra._internal.utils import _run_hydra, get_args_parser
+import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import (
     HydraException,
@@ -25,13 +26,13 @@ from hydra.errors import (
     OverrideParseException,
 )
 from hydra.types import RunMode
-from hydra.version import setbase
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from yaml import MarkedYAMLError
 
 from .commands import (
     CONFIG_PACKAGE,
+    OPTIONS_WITH_VALUE,
     OWN_OPTIONS,
     USER_ERROR,
     configuration,
@@ -43,7 +44,7 @@ from .io.atomic import is_disk_full
 from .io.errors import ResphysError, ResphysWarning, did_you_mean
 from .io.process import collector_paused, ends_as_after_ctrl_c
 from .io.settings import Settings, parse
-from .option_files import names_are_texts, run_schema
+from .option_files import own_options, run_schema, search_path_read_here
 from .overrides import LateOverride, adjust, readable
 from .settings.run import RunSettings
 
@@ -95,30 +96,38 @@ class _Job:
 
     def run(self, command: str, arguments: Sequence[str]) -> None:
         """Composes the configuration and runs the command with it."""
-        parser = get_args_parser()
-        parsed = parser.parse_intermixed_args([*_user_options(), *arguments])
-        if parsed.experimental_rerun is not None:
+        options, flags = _options(arguments)
+        if options.pop("experimental_rerun", None) is not None:
             raise HydraException(
                 "--experimental-rerun reads a pickle, which can run code: use overrides instead"
             )
-        if command in TYPED and parsed.cfg == "job":
-            self.shown, parsed.cfg = parsed.package or "", None
-        if parsed.overrides:
+        if command in TYPED and options.get("cfg") == "job":
+            del options["cfg"]
+            self.shown = options.pop("package", "")
+        folder = options.pop("config_dir", _user_folder())
+        overrides = options.pop("overrides")
+        if overrides:
             schema = (
                 run_schema()
                 if command in TYPED
                 else _function(self.function)[1].model_json_schema()
             )
-            parsed.overrides, self.late = readable(
-                parsed.overrides, schema, parsed.config_dir, parsed.multirun
-            )
-        parsed.overrides += _SILENT if self.shown is not None else ()
+            words, self.late = readable(overrides, schema, folder, "--multirun" in flags)
+            overrides = [search_path_read_here(word) for word in words]
+        overrides += _SILENT if self.shown is not None else ()
+        flags += [f"--{name.replace('_', '-')}={value}" for name, value in options.items()]
         OmegaConf.register_new_resolver("run_label", self._label, replace=True)
-        setbase("1.3")
-        with ends_as_after_ctrl_c(), names_are_texts():
-            _run_hydra(
-                parsed, parser, self._call, f"pkg://{CONFIG_PACKAGE}", configuration(command)
-            )
+        job = hydra.main(
+            version_base="1.3",
+            config_path=f"pkg://{CONFIG_PACKAGE}",
+            config_name=configuration(command),
+        )(self._call)
+        typed, sys.argv = sys.argv, [*sys.argv[:1], *flags, *overrides]
+        try:
+            with ends_as_after_ctrl_c(), own_options(folder):
+                job()
+        finally:
+            sys.argv = typed
 
     def _label(self, overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
         return run_label([*overrides, *(override.argument for override in self.late)], excluded)
@@ -204,14 +213,24 @@ def _sentence_of_warning(
     return f"{filename}:{lineno}: {category.__name__}: {message}\n"
 
 
-def _user_options() -> list[str]:
-    """Arguments that add the folder of the user's own options, if it exists.
+def _options(arguments: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
+    """Options of Hydra that have a value, with ``overrides``, and the flags that have none."""
+    parser = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
+    for name, *short in OPTIONS_WITH_VALUE:
+        optional: dict[str, Any] = {"nargs": "?", "const": "all"} if name == "--info" else {}
+        parser.add_argument(name, *short, **optional)
+    parser.add_argument("--multirun", "-m", action="store_true")
+    parser.add_argument("overrides", nargs="*", default=[])
+    known, flags = parser.parse_known_intermixed_args(arguments)
+    options = vars(known)
+    return options, [*flags, *["--multirun"][: options.pop("multirun", False)]]
 
-    A later --config-dir replaces it.
-    """
+
+def _user_folder() -> str | None:
+    """The folder of the user's own options in the working directory, if it exists."""
     folder = Path.cwd() / OWN_OPTIONS
     if not folder.is_dir():
-        return []
+        return None
     packaged = resources.files(CONFIG_PACKAGE)
     for path in sorted(folder.glob("*/*.yaml")):
         name = path.relative_to(Path.cwd())
@@ -220,7 +239,7 @@ def _user_options() -> list[str]:
                 f"warning: {name} is ignored: the package has an option of that name",
                 file=sys.stderr,
             )
-    return ["--config-dir", str(folder)]
+    return str(folder)
 
 
 def _show(config: DictConfig, key: str) -> None:

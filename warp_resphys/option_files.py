@@ -12,20 +12,25 @@ which these groups are null.
 from __future__ import annotations
 
 import io
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import yaml
-from hydra._internal.core_plugins import file_config_source
-from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.object_type import ObjectType
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
-from hydra.plugins.config_source import ConfigResult
+from hydra.plugins.config_source import ConfigResult, ConfigSource
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
 
+from .commands import quote
+from .io.errors import InputError
 from .io.setting_errors import Path as KeyPath
 from .io.setting_errors import Schema, is_text
 from .io.text import read_text
@@ -33,17 +38,38 @@ from .settings.run import RunSettings
 
 _REPLACE: Final = "_replace_"
 _EMPTYING: Final = ".emptying"
+_Names = list[str]  # Sources have a method `list`.
+_SCHEME: Final = "options"  # of folders that are read here, on Hydra's search path
 
 
-class _OptionSource(file_config_source.FileConfigSource):
+class _OptionSource(ConfigSource):
     """Reads the files of a folder."""
 
+    @staticmethod
+    def scheme() -> str:
+        return _SCHEME
+
+    def available(self) -> bool:
+        return self.is_group("")
+
+    def is_group(self, config_path: str) -> bool:
+        return Path(self.path, config_path).is_dir()
+
     def is_config(self, config_path: str) -> bool:
-        return bool(super().is_config(config_path.removesuffix(_EMPTYING)))
+        return self._file(config_path).is_file()
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> _Names:
+        found: _Names = []
+        for name in os.listdir(Path(self.path, config_path)):
+            self._list_add_result(found, os.path.join(config_path, name), name, results_filter)
+        return sorted(set(found))
+
+    def _file(self, config_path: str) -> Path:
+        return Path(self.path, self._normalize_file_name(config_path.removesuffix(_EMPTYING)))
 
     def load_config(self, config_path: str) -> ConfigResult:
         name = config_path.removesuffix(_EMPTYING)
-        path = Path(self.path, self._normalize_file_name(name)).resolve()
+        path = self._file(name).resolve()
         text = read_text(path)
         header = self._get_header_dict(text)
         package = header["package"] or name.rpartition("/")[0].replace("/", ".")
@@ -65,19 +91,56 @@ class _OptionSource(file_config_source.FileConfigSource):
         )
 
 
-@contextmanager
-def names_are_texts() -> Iterator[None]:
-    """Lets Hydra read the files of folders as this module describes.
+class _OptionFolders(SearchPathPlugin):
+    """Puts folders of options on Hydra's search path.
 
-    Its registry of sources is restored at the end.
+    Attributes:
+        added: the folders, within `own_options`.
     """
-    Plugins.instance()  # registers Hydra's sources
-    sources, scheme = SourcesRegistry.instance().types, _OptionSource.scheme()
-    before, sources[scheme] = sources[scheme], _OptionSource
+
+    added: ClassVar[list[str] | None] = None
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        if self.added is None:
+            return
+        for element in search_path.get_path():
+            element.path = _read_here(element.path)
+        for folder in self.added:
+            search_path.append("options", _read_here(folder))
+
+
+@contextmanager
+def own_options(folder: str | None) -> Iterator[None]:
+    """Lets Hydra read folders as this module describes, and one more folder than it would.
+
+    Raises:
+        InputError: there is no such folder.
+    """
+    if folder is not None and not os.path.isdir(folder):
+        place = os.path.abspath(folder)
+        raise InputError(f"Additional config directory '{place}' not found")
+    for plugin in (_OptionSource, _OptionFolders):
+        Plugins.instance().register(plugin)
+    _OptionFolders.added = [] if folder is None else [os.path.abspath(folder)]
     try:
         yield
     finally:
-        sources[scheme] = before
+        _OptionFolders.added = None
+
+
+def search_path_read_here(override: str) -> str:
+    """An override of Hydra's search path whose folders are read here; others stay."""
+    key, _, value = override.partition("=")
+    if key.lstrip("+") != "hydra.searchpath" or value[:1] != "[":
+        return override
+    places: Any = OverridesParser.create().parse_override(override).value()
+    return f"{key}=[{','.join(quote(_read_here(str(place))) for place in places)}]"
+
+
+def _read_here(place: str) -> str:
+    """A place on Hydra's search path, which `_OptionSource` reads if it is a folder."""
+    folder = place.removeprefix("file://")
+    return place if "://" in folder else f"{_SCHEME}://{folder}"
 
 
 @cache

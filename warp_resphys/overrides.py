@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from functools import reduce
 from importlib import resources
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, Final
+from types import MappingProxyType, NoneType
+from typing import Any, Final, get_args
 
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -26,6 +26,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from .commands import CONFIG_PACKAGE, quote, quote_name
 from .io.errors import InputError
 from .io.setting_errors import Schema, is_text
+from .settings.run import RunSettings
 
 # A text that Hydra reads as such, a part of a key that it reads, a text in quotes, and a call of a
 # function.
@@ -130,13 +131,14 @@ def composed(name: str, arguments: Sequence[str] = ()) -> Any:
 def adjust(config: DictConfig, choices: Mapping[str, str], late: Sequence[LateOverride]) -> None:
     """Changes a configuration that Hydra has composed from chosen options.
 
-    A group that an experiment set to null stays null: Hydra gives it what a budget changes in it,
-    and nothing else.
+    A group that an experiment set to null stays null, if the settings allow that: Hydra gives it
+    what a budget changes in it, and nothing else.
     """
     change = resources.files(CONFIG_PACKAGE) / _BUDGETS / f"{choices.get(_BUDGETS)}.yaml"
     changed: Any = OmegaConf.create(change.read_text(encoding="utf-8")) if change.is_file() else {}
     for name, group in changed.items():
-        if config.get(name) == group:
+        field = RunSettings.model_fields.get(name)
+        if field and NoneType in get_args(field.annotation) and config.get(name) == group:
             config[name] = None
     for override in late:
         override.apply(config)

@@ -344,3 +344,44 @@ def test_an_experiment_may_choose_its_network(tmp_path):
     own = (f"hydra.searchpath=[file://{tmp_path}]", "experiment=own")
     assert settings(*own).network == settings("network=reduced").network.changed(force_modes=4)
     assert settings(*own, "network=published").network.kind == "nodal"
+
+
+CONF = Path(__file__).parents[2] / "conf"
+
+
+def keys_of(file):
+    """Dotted names of the keys that a file of conf/ sets, and the names of those it extends."""
+    content = yaml.safe_load((CONF / file).read_text(encoding="utf-8"))
+    extended = [
+        entry
+        for entry in content.pop("defaults", [])
+        if isinstance(entry, str) and entry != "_self_"
+    ]
+    return [*_dotted(content)], extended
+
+
+def _dotted(group):
+    for name, value in group.items():
+        parts = _dotted(value) if isinstance(value, dict) and value else [""]
+        yield from (f"{name}.{part}".rstrip(".") for part in parts)
+
+
+def no_key_twice(files):
+    keys = [key for file in files for key in keys_of(file)[0]]
+    assert len(keys) == len({*keys})
+    return keys
+
+
+@pytest.mark.parametrize("kind", ["released", "pressure", "poses", "record"])
+def test_a_kind_of_trials_and_the_files_that_it_extends_set_no_key_twice(kind):
+    files = [f"recordings/{kind}.yaml"]
+    for file in files:
+        files += [f"recordings/{name}.yaml" for name in keys_of(file)[1]]
+    assert files[-1] == "recordings/common.yaml"
+    assert "data.kind" in no_key_twice(files)
+
+
+@pytest.mark.parametrize("origin", sorted(path.stem for path in (CONF / "trial_source").iterdir()))
+def test_a_budget_changes_a_key_in_one_file(origin):
+    changes = (f"budget_on/{origin}_quick.yaml", "control_on/figures_quick.yaml")
+    assert {"budget", "trainer.epochs"} < {*no_key_twice(("budget/quick.yaml", *changes))}

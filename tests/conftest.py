@@ -2,6 +2,7 @@ import contextlib
 import functools
 import gc
 import os
+import re
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported, as the command does
 
@@ -12,16 +13,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import hydra
 import pytest
 import torch
 import warp as wp
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigSource
+from omegaconf import OmegaConf
 
 from support.command_line import enable_loggers
 from support.main_job import IN_RUN, TINY, files, run, without_reports
 from support.scenes import body_scene
+from warp_resphys import overrides
 from warp_resphys.core.mesh import readers
 from warp_resphys.core.mesh.boxes import box_hexahedra
 from warp_resphys.data.recordings import recording_files
@@ -173,6 +178,37 @@ def _configurations_are_read_once():
             "model_json_schema",
             classmethod(functools.cache(Settings.model_json_schema.__func__)),
         )
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _options_are_composed_once():
+    """What `overrides.composed` makes of the same options, before it sets single keys.
+
+    A copy for each test.
+    """
+    kept: dict[Any, Any] = {}
+
+    def compose(name: str, words: list[str], **options: bool) -> Any:
+        others = [at for at, word in enumerate(words, 1) if not word.startswith("++")]
+        first = max(others, default=0)  # of the single keys at the end
+        chosen = (name, *words[:first])
+        parsed = OverridesParser.create().parse_overrides(words[first:])
+        if any(override.is_sweep_override() for override in parsed):
+            return hydra.compose(name, words, **options)
+        places = re.findall(r"file://([^],']+)", " ".join(chosen))
+        outside = [path for place in places for path in sorted(Path(place).rglob("*.yaml"))]
+        key = (*chosen, *((str(path), path.read_bytes()) for path in outside))
+        if key not in kept:
+            kept[key] = hydra.compose(name, list(chosen[1:]), **options)
+        config = deepcopy(kept[key])
+        for override in parsed:
+            name, value = override.key_or_group, override.value()
+            OmegaConf.update(config, name, value, merge=True, force_add=True)
+        return config
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(overrides, "compose", compose)
         yield
 
 

@@ -496,7 +496,7 @@ class TestProcess:
         out, err = self.start(config_dir, heavy, "--help").communicate(timeout=60)
         assert "\nexperiment: beam_" in out
         names = out.splitlines()[-1].removeprefix("imported: ").split()
-        ours = ("", ".cli", ".commands", ".conf", ".io", ".io.errors", ".io.process")
+        ours = ("", ".cli", ".commands", ".conf", ".io", ".io.errors", ".io.process", ".moved")
         assert set(names) == {f"warp_resphys{name}" for name in ours}
         assert err == ""
 

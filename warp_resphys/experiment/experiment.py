@@ -187,7 +187,10 @@ class Experiment:
             {"actuation": settings.actuation} if "actuation" in settings.reads else {}
         )
         return ObservedMotions(
-            *(trials, observe, settings.release, settings.payload_at),
+            trials,
+            observe,
+            settings.release,
+            settings.payload_at,
             train_fraction=settings.train_fraction,
             sensors=sensors,
             **more,

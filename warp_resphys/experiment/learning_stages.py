@@ -118,7 +118,8 @@ def identify_law(context: StageContext) -> None:
     kept = context.run_dir / f"{context.name}_parts.safetensors"
     known = None if file is None else read_law(file)
     law = law_search.identify_law(
-        *(experiment.simulator("identified"), experiment.motions),
+        experiment.simulator("identified"),
+        experiment.motions,
         {} if settings.identify is None else settings.identify.parameters,
         identified=experiment.identified("sysid"),
         train=settings.split.train,

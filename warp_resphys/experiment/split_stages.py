@@ -122,7 +122,9 @@ class SplitStages:
         reconstructed = split.train + split.validation + compared
         for model in (model for model in LEARNED if model in run.models and model != SIMFREE):
             self.add(
-                *(f"reconstruct_{model}", reconstruct, (files.reconstruction_file(model),)),
+                f"reconstruct_{model}",
+                reconstruct,
+                (files.reconstruction_file(model),),
                 ("reconstruction", "network.acts"),
                 model=model,
                 reconstructed=reconstructed,
@@ -168,7 +170,9 @@ class SplitStages:
             if stage.name.startswith(("train_", "reconstruct_resphys"))
         ]
         self.add(
-            *("evaluate", evaluate, (files.ROLLOUTS, files.ERRORS)),
+            "evaluate",
+            evaluate,
+            (files.ROLLOUTS, files.ERRORS),
             (*NETWORKS, "reconstruction", "published", "correct_uncorrected", "data.horizons"),
             made,
             groups=groups,

@@ -158,7 +158,7 @@ def test_another_version_is_told_and_runs_stages_again(installed, tmp_path, monk
         ),
         (
             "energies.magnet._target_=torch.nn.Linear",
-            r"Linear is no subclass of warp_resphys\.energies\.base\.Energy",
+            r"Linear is no subclass of warp_resphys\.core\.energies\.base\.Energy",
         ),
         (
             "energies.magnet.magnetisatoin=3",

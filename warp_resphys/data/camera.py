@@ -13,9 +13,9 @@ as a change of size.
 A `Lens` moves the point (x, y) = (X / Z, Y / Z) of the image at distance one, with r^2 = x^2 + y^2,
 to
 
-    x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
-        + 2 p1 x y + p2 (r^2 + 2 x^2),
-    y' = y (same) + p1 (r^2 + 2 y^2) + 2 p2 x y
+    x' = x q + 2 p1 x y + p2 (r^2 + 2 x^2),
+    y' = y q + p1 (r^2 + 2 y^2) + 2 p2 x y,
+    q = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
 
 (Brown 1966, with OpenCV's names), which the matrix K takes to pixels (Hartley and Zisserman,
 Multiple View Geometry, 2nd edition, eq. 6.8). Its focal lengths are corrected by a factor, its

@@ -53,8 +53,7 @@ def without_physics(
 
     Returns:
         By model: the observed points (R, T, M, 3) [m], the settings in words, and of models that
-            cannot predict all
-        trials, the reason.
+        cannot predict all trials, the reason.
     """
     trials = motions.trials
     shape = (len(names), *trials.observed.shape[1:])

@@ -388,11 +388,10 @@ class SeenPose:
 
         Returns:
             What the picture shows of: ``outline_mm``, the mean distance of the outlines, both ways,
-                at the body's mean
-            depth; ``outline_px``, the same in pixels; ``overlap``, the common area over that of
-            both together, outside of the clamps; ``cloud_mm``, the mean distance of the points of a
-            cloud from the surface, of farther ones its reach; and ``points_mm``, the mean distance
-            of the tracked points that were seen, at their depths.
+            at the body's mean depth; ``outline_px``, the same in pixels; ``overlap``, the common
+            area over that of both together, outside of the clamps; ``cloud_mm``, the mean distance
+            of the points of a cloud from the surface, of farther ones its reach; and ``points_mm``,
+            the mean distance of the tracked points that were seen, at their depths.
         """
         q = q.double().cpu()
         corrections = PlacedCamera.corrections(values)

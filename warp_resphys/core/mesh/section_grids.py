@@ -21,8 +21,7 @@ def section_grids(
 
     Returns:
         For each block: (k + 1, l + 1) points, with the second axis counter-clockwise of the first,
-            and the index of its
-        chamber, from 0, or `SOLID`.
+        and the index of its chamber, from 0, or `SOLID`.
     """
     growth = section.growth(divisions) if order == 1 else Growth(0.0, 0.0)
     grids, chambers = [], []

@@ -98,7 +98,7 @@ defaults:
   - override /mesh: beam_hexahedra  # 10 x 3 x 3 cm; or a file of your own, mesh: file
   - _self_
 name: my_robot
-title: My robot  # short: title: My robot -> trainer: {{gate: false}}
+title: My robot
 mesh: {{divisions: [8, 2, 2]}}
 fixed: {{x: 0.0}}  # the clamped vertices
 tip: {{x: 0.1}}

@@ -89,7 +89,7 @@ FIRST_USE = """
 import numpy as np
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
-from dynamics.test_threads import CLOSE, FLOOR, results, simulator
+from core.dynamics.test_threads import CLOSE, FLOOR, results, simulator
 together = Barrier(4)
 def first(number):
     together.wait()

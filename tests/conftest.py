@@ -24,6 +24,7 @@ from hydra.plugins.config_source import ConfigSource
 from omegaconf import OmegaConf
 
 from support.command_line import enable_loggers
+from support.devices import device
 from support.main_job import IN_RUN, TINY, files, run, without_reports
 from support.scenes import body_scene
 from warp_resphys import overrides
@@ -82,7 +83,7 @@ DECODE_IN_PROCESSES = {
     "test_recordings",
 }
 COMMAND = render.COMMAND  # which tests without drawing replace
-DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+__all__ = ["device"]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -100,11 +101,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("numerics")
         elif item.path.parent.name == "validation":
             item.add_marker("validation")
-
-
-@pytest.fixture(params=DEVICES)
-def device(request: pytest.FixtureRequest) -> str:
-    return request.param
 
 
 def folder_beside_the_repository(name: str, content: str) -> Path:

@@ -6,6 +6,7 @@ Imports point up it, and never in a circle.
 import ast
 import functools
 import importlib
+import importlib.util
 import re
 import subprocess
 import sys
@@ -14,6 +15,9 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+
+from warp_resphys.io.errors import ResphysWarning
+from warp_resphys.moved import MOVED
 
 REPOSITORY = Path(__file__).parents[1]
 PACKAGE = REPOSITORY / "warp_resphys"
@@ -160,3 +164,30 @@ def test_one_name_is_one_class():
     )
     twice = {name for name, count in names.items() if count > 1 and not name.startswith("_")}
     assert twice == set()
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("energies.contact.obstacles", "core.energies.contact.obstacles"),
+        ("stepping", "core.stepping"),
+        ("settings.silicones", "core.energies.silicones"),
+    ],
+)
+def test_a_module_that_has_moved_is_one_under_both_names(old, new, monkeypatch):
+    """Also below a package; the warning has the new name and the end of the old one."""
+    for name in [name for name in sys.modules if name.startswith(f"warp_resphys.{old}")]:
+        monkeypatch.delitem(sys.modules, name)
+    wanted = importlib.import_module(f"warp_resphys.{new}")
+    spec = wanted.__spec__
+    with pytest.warns(
+        ResphysWarning, match=rf"warp_resphys\.{re.escape(old)} is now .*{new}: .*0\.3"
+    ):
+        assert importlib.import_module(f"warp_resphys.{old}") is wanted
+    assert wanted.__spec__ is spec
+    assert wanted.__name__ == f"warp_resphys.{new}"
+
+
+def test_every_module_that_has_moved_is_where_its_old_name_leads():
+    for after in MOVED.values():
+        assert importlib.util.find_spec(f"warp_resphys.{after}") is not None

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from importlib import import_module, resources
+from importlib import resources
 from pathlib import Path
 from typing import Any, Final, get_type_hints
 
@@ -30,6 +30,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from yaml import MarkedYAMLError
 
+from .applications import function_at
 from .commands import (
     CONFIG_PACKAGE,
     OPTIONS_WITH_VALUE,
@@ -187,9 +188,8 @@ def _one_sentence_each() -> Iterator[None]:
 
 def _function(name: str) -> tuple[Callable[..., Any], type[Settings]]:
     """The function of a command, and the class of its settings."""
-    module, _, function = name.partition(":")
     with collector_paused():
-        run = getattr(import_module(f"{__package__}.{module}"), function)
+        run = function_at(name)
     settings, *_ = get_type_hints(run).values()
     return run, settings
 

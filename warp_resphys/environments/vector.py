@@ -52,7 +52,7 @@ class ActionMapping:
 
 @dataclass(frozen=True)
 class VectorOptions:
-    """How robots of an environment are observed, reset and drawn.
+    """Options of a vector environment: observation, resets and drawing.
 
     Attributes:
         noise: standard deviation of observed coordinates [m], if the world has none.

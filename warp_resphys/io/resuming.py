@@ -176,7 +176,7 @@ def expected_seconds(stages: Sequence[Stage], run_dir: str | Path) -> dict[str, 
 
 
 def _works_on(settings: Mapping[str, Any]) -> list[Any]:
-    """What the duration of a stage depends on most."""
+    """Returns the settings on which the duration of a stage depends most."""
     return [settings.get(key) for key in ("mesh", "data", "budget", "time_step")]
 
 

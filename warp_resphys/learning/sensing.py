@@ -1,6 +1,5 @@
-"""What was observed at the frames of trials, at the steps of a simulator.
-
-Readings of force sensors in a step.
+"""Observations of trials, interpolated from their frames to a simulator's steps,
+and readings of force sensors in a step.
 """
 
 from collections.abc import Sequence

@@ -109,7 +109,7 @@ _PLAIN = TypeAdapter(Identification)
 
 @dataclass(frozen=True)
 class Searches:
-    """How searches run that follow one another, and where they are kept.
+    """Limits of searches that follow one another, and the checkpoint that keeps them.
 
     Attributes:
         max_evaluations: see `search_parameters`.
